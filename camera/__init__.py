@@ -1,0 +1,1 @@
+"""Pixels to pose fixes. Imports only `fusion.measurements` and `fusion.geometry` of the other packages."""

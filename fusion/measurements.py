@@ -1,0 +1,207 @@
+"""The vocabulary: what sensors say, what the filter answers.
+
+Every `t` is float seconds on one clock (live: the host's monotonic clock), **when the event happened**:
+mid-exposure for a frame, the sampling instant for an IMU. `arrival` is when it reached the service.
+Frames: `world` (x east on the floor plan, y north, z up), `body` (x forward, y left, z up). SI units, radians.
+
+A 6 x 6 pose covariance is ordered (x, y, z, rotation about x, y, z); both blocks are along the fixed *world*
+axes, which is also the order and meaning of ROS's PoseWithCovariance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class MeasurementError(ValueError):
+    """A measurement that cannot be one: a wrong shape, NaN, a covariance that is none. The text says which."""
+
+
+class ImuSample(NamedTuple):
+    """One reading: `t` in s, angular rate in rad/s, specific force in m/s2 (+9.81 on z at rest), body axes."""
+
+    t: float
+    gx: float
+    gy: float
+    gz: float
+    ax: float
+    ay: float
+    az: float
+
+
+@dataclass(frozen=True, slots=True)
+class ImuBatch:
+    """Consecutive IMU readings of one robot.
+
+    `samples`: (n, 7) float64, columns as in `ImuSample`; stamps need not be sorted.
+    Raises MeasurementError on a wrong shape or a number that is not finite.
+    """
+
+    robot: str
+    arrival: float
+    samples: Array
+
+    def __post_init__(self) -> None:
+        samples = np.ascontiguousarray(self.samples, dtype=np.float64)
+        if samples.ndim != 2 or samples.shape[1] != 7:
+            raise MeasurementError(f"IMU samples of shape {samples.shape}: (n, 7) is needed, t gx gy gz ax ay az")
+        if not np.isfinite(samples).all():
+            row = int(np.flatnonzero(~np.isfinite(samples).all(axis=1))[0])
+            raise MeasurementError(f"IMU sample {row} is not finite: {samples[row].tolist()}")
+        object.__setattr__(self, "samples", samples)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseHypothesis:
+    """One pose that explains what a camera saw.
+
+    `position`: (3,) m, world. `quaternion_wxyz`: (4,) unit, world_from_body. `covariance`: (6, 6), see the module.
+    `misfit`: squared reprojection error over its variance (dimensionless), by which two hypotheses are compared.
+    A fix that knows no tilt says so with a large variance about x and y; one that knows no attitude, about all three.
+    Raises MeasurementError for a shape, a NaN, a quaternion or a covariance that cannot be.
+    """
+
+    position: Array
+    quaternion_wxyz: Array
+    covariance: Array
+    misfit: float = 0.0
+
+    def __post_init__(self) -> None:
+        position = np.asarray(self.position, dtype=np.float64)
+        quaternion = np.asarray(self.quaternion_wxyz, dtype=np.float64)
+        covariance = np.asarray(self.covariance, dtype=np.float64)
+        if position.shape != (3,) or quaternion.shape != (4,) or covariance.shape != (6, 6):
+            raise MeasurementError(
+                f"pose of shapes {position.shape}, {quaternion.shape}, {covariance.shape}: "
+                "(3,), (4,), (6, 6) are needed"
+            )
+        if not (np.isfinite(position).all() and np.isfinite(quaternion).all() and np.isfinite(covariance).all()):
+            raise MeasurementError("pose with a number that is not finite")
+        norm = float(np.linalg.norm(quaternion))
+        # 1e-3: six printed decimals keep it, a quaternion in the wrong units or order of magnitude does not.
+        if abs(norm - 1.0) > 1e-3:
+            raise MeasurementError(f"quaternion of norm {norm:.6g}: 1 is needed (order w, x, y, z)")
+        if not (np.diag(covariance) > 0.0).all():
+            raise MeasurementError("covariance with a variance that is not positive")
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "quaternion_wxyz", quaternion / norm)
+        object.__setattr__(self, "covariance", 0.5 * (covariance + covariance.T))
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFix:
+    """An absolute pose of one robot from one frame: one hypothesis, or two (a flat marker has two poses).
+
+    The likelier hypothesis comes first. `source` names the camera.
+    """
+
+    robot: str
+    t: float
+    arrival: float
+    hypotheses: tuple[PoseHypothesis, ...]
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.hypotheses) not in (1, 2):
+            raise MeasurementError(f"a fix with {len(self.hypotheses)} hypotheses: 1 or 2 are possible")
+        if not (math.isfinite(self.t) and math.isfinite(self.arrival)):
+            raise MeasurementError(f"fix stamped {self.t}, arrived {self.arrival}: both must be finite")
+
+
+class Mode(StrEnum):
+    """What a pose rests on.
+
+    INIT no fix yet; FULL IMU and recent fixes; COAST no fix for a while, IMU alone; DEGRADED, INVALID the same with
+    an uncertainty beyond use for steering, for anything; NO_IMU fixes alone; LOST neither.
+    """
+
+    INIT = "INIT"
+    FULL = "FULL"
+    COAST = "COAST"
+    DEGRADED = "DEGRADED"
+    INVALID = "INVALID"
+    NO_IMU = "NO_IMU"
+    LOST = "LOST"
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """An estimate for the instant `t`.
+
+    `position`, `velocity`: (3,) m and m/s, world. `quaternion_wxyz`: (4,), world_from_body.
+    `angular_velocity`: (3,) rad/s, body. `covariance`: (6, 6), see the module. `velocity_covariance`: (3, 3), world.
+    `reset_id` rises by one whenever the pose was set anew instead of corrected.
+    `fix_age`: s from the last accepted fix's capture to `t`; inf before the first.
+    """
+
+    robot: str
+    t: float
+    position: Array
+    quaternion_wxyz: Array
+    velocity: Array
+    angular_velocity: Array
+    covariance: Array
+    velocity_covariance: Array
+    mode: Mode
+    reset_id: int
+    fix_age: float
+
+    @property
+    def yaw(self) -> float:
+        """Heading of body x in the floor plane, rad, anticlockwise from world x, in (-pi, pi]."""
+        w, x, y, z = self.quaternion_wxyz
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+class Outcome(IntEnum):
+    """What became of a fix.
+
+    INITIALISED it started the filter; ACCEPTED; INFLATED accepted with less weight; REJECTED too far from the
+    prediction; REINITIALISED it agreed with the rejects before it, and the pose was set anew; PENDING it is stamped
+    later than the IMU data so far and waits for them; TOO_LATE older than the buffer; DUPLICATE the same again.
+    """
+
+    PENDING = 0
+    INITIALISED = 1
+    ACCEPTED = 2
+    INFLATED = 3
+    REJECTED = 4
+    REINITIALISED = 5
+    TOO_LATE = 6
+    DUPLICATE = 7
+
+
+@dataclass(frozen=True, slots=True)
+class FixOutcome:
+    """How a fix was judged.
+
+    `d2`: squared Mahalanobis distance of the innovation (6 dof), `d2_position` and `d2_attitude` of its halves (3).
+    `innovation`: (6,) position then rotation, body axes, m and rad; `innovation_sigma`: (6,) its expected size.
+    `hypothesis`: index of the pose used; `margin`: by how much it beat the other (inf for one alone).
+    """
+
+    robot: str
+    t: float
+    arrival: float
+    outcome: Outcome
+    d2: float = math.nan
+    d2_position: float = math.nan
+    d2_attitude: float = math.nan
+    innovation: Array = field(default_factory=lambda: np.full(6, np.nan))
+    innovation_sigma: Array = field(default_factory=lambda: np.full(6, np.nan))
+    hypothesis: int = 0
+    margin: float = math.inf
+    source: str = ""
+
+    @property
+    def delay(self) -> float:
+        """Seconds from capture to arrival."""
+        return self.arrival - self.t

@@ -1,0 +1,74 @@
+"""Every tunable number of the filter: unit, meaning, default, source. SI units and radians.
+
+Densities are of continuous white noise: the variance of an integral over `dt` seconds is `density**2 * dt`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+Motion = Literal["free", "ground", "differential"]
+Engine = Literal["numba", "filterpy"]
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+
+# Standard gravity, m/s2 (CGPM 1901). Its local variation, 0.3 %, is absorbed by the accelerometer bias.
+GRAVITY = 9.80665
+
+
+class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
+    """Noise, priors and gates of one robot's filter.
+
+    The noise defaults are those of a consumer MEMS IMU mounted on a robot that shakes it: about ten times a
+    datasheet. The gates are quantiles of the chi-square distribution.
+    """
+
+    gyro_noise: Positive = 1e-3
+    """rad/s/sqrt(Hz): white noise of the angular rate."""
+    accel_noise: Positive = 2e-2
+    """m/s2/sqrt(Hz): white noise of the specific force."""
+    gyro_bias_walk: NotNegative = 1e-4
+    """rad/s2/sqrt(Hz): random walk of the gyroscope bias."""
+    accel_bias_walk: NotNegative = 1e-3
+    """m/s3/sqrt(Hz): random walk of the accelerometer bias."""
+
+    gyro_bias_sigma: NotNegative = 0.02
+    """rad/s: prior of the gyroscope bias at the first fix."""
+    accel_bias_sigma: NotNegative = 0.2
+    """m/s2: prior of the accelerometer bias at the first fix."""
+    velocity_sigma: Positive = 0.5
+    """m/s: prior of the velocity at the first fix."""
+    time_offset_sigma: NotNegative = 0.0
+    """s: prior of the camera's time offset, to be added to a fix's stamp; 0 holds it at 0."""
+    tilt_sigma: NotNegative = 0.0
+    """rad: prior of the angle between the world's z axis and the vertical, about x and y; 0 holds it at 0."""
+
+    stamp_jitter: NotNegative = 0.0
+    """s: random error of a fix's stamp, which adds (velocity * jitter)^2 to its covariance."""
+    fix_position_sigma: Positive = 0.005
+    """m: error of a fix that brings no covariance of its own, each axis."""
+    fix_attitude_sigma: Positive = 0.0175
+    """rad: the same of its rotation, about each axis."""
+
+    gate: Positive = 22.46
+    """chi-square .999 at 6 degrees of freedom: a fix whose d2 is below is accepted as it is."""
+    gate_block: Positive = 16.27
+    """chi-square .999 at 3 degrees of freedom: the same for position and for attitude alone."""
+    gate_inflation: Annotated[float, Meta(ge=1.0)] = 3.0
+    """up to this multiple of a gate a fix is accepted with its covariance inflated until it fits, beyond rejected."""
+    hypothesis_margin: NotNegative = 4.0
+    """score by which one pose of a flat marker must beat the other to be believed with its tilt."""
+
+    buffer: Positive = 2.0
+    """s: how late a measurement may come and still be put in its place."""
+    imu_gap: Positive = 0.2
+    """s: a longer pause of the IMU is bridged with constant velocity."""
+    coast_after: Positive = 1.5
+    """s without an accepted fix: mode COAST."""
+    degraded_sigma: Positive = 0.05
+    """m: largest position sigma up to which a coasting pose is still good to steer by."""
+    invalid_sigma: Positive = 0.30
+    """m: largest position sigma up to which it is good for anything."""

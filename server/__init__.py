@@ -1,0 +1,1 @@
+"""Wiring: configuration, sockets, recordings, the command line. Nothing but tests and notebooks imports it."""
