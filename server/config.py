@@ -1,0 +1,320 @@
+"""The configuration file: TOML in, checked structs out.
+
+Units are in the keys (`size_mm`, `yaw_deg`, `position_m`); a key without one is in SI units. Every mistake is a
+ConfigError whose text names the file, the line where it can be found, the key, what is there and what would be right.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from fusion.params import Engine, FilterParams, Motion
+
+DEFAULT_PORT = 5678
+
+Metres = Annotated[float, Meta(ge=-1000.0, le=1000.0)]
+Position = tuple[Metres, Metres, Metres]
+Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
+MarkerId = Annotated[int, Meta(ge=0, le=65535)]
+MarkerSize = Annotated[float, Meta(ge=5.0, le=2000.0)]
+Rate = Annotated[float, Meta(gt=0.0, le=1000.0)]
+RateOrNone = Annotated[float, Meta(ge=0.0, le=1000.0)]
+# Names appear in addresses (`?robots=a,b`) and as folders of a recording.
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.\-]*$", max_length=64)]
+Text = Annotated[str, Meta(min_length=1)]
+KeyPath = tuple[str | int, ...]
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used. The text says where, what was found and what would be right."""
+
+
+class ServerConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    host: Text = "127.0.0.1"
+    port: Annotated[int, Meta(ge=0, le=65535)] = DEFAULT_PORT
+    """0: any free one, which the log names."""
+    pose_rate_hz: Rate = 50.0
+
+
+class CameraConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    name: Name
+    source: Annotated[int, Meta(ge=0)] | Text
+    calibration: Text
+    """Path of the intrinsics; `load` makes it absolute, and `source` too where that is a path."""
+    dictionary: Text = "4X4_50"
+    width_px: Annotated[int, Meta(ge=0, le=20000)] = 0
+    height_px: Annotated[int, Meta(ge=0, le=20000)] = 0
+    frame_rate_hz: RateOrNone = 0.0
+    time_offset: Annotated[float, Meta(ge=-2.0, le=2.0)] = 0.0
+    """s, added to the stamps of its frames."""
+
+
+class AnchorConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    id: MarkerId
+    size_mm: MarkerSize
+    position_m: Position
+    yaw_deg: Degrees = 0.0
+
+
+class MarkerConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    id: MarkerId
+    size_mm: MarkerSize
+    position_m: Position = (0.0, 0.0, 0.0)
+    yaw_deg: Degrees = 0.0
+
+
+class ImuConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    source: Text = "websocket"
+    protocol: Literal["json", "csv"] = "json"
+    baud: Annotated[int, Meta(ge=1200, le=12_000_000)] = 115200
+    pose_rate_hz: RateOrNone = 0.0
+    """Poses sent back down a serial line; a WebSocket robot says its rate itself."""
+
+
+class RobotConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    name: Name
+    marker: Annotated[tuple[MarkerConfig, ...], Meta(min_length=1)]
+    motion: Motion = "ground"
+    engine: Engine = "numba"
+    imu: ImuConfig = ImuConfig()
+    filter: FilterParams = FilterParams()
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True):
+    server: ServerConfig = ServerConfig()
+    camera: tuple[CameraConfig, ...] = ()
+    anchor: tuple[AnchorConfig, ...] = ()
+    robot: tuple[RobotConfig, ...] = ()
+
+
+# What would be right, by key: for the sentence that follows a value that is not.
+_RIGHT = {
+    "server": "a [server] section",
+    "camera": "[[camera]] sections, with two brackets",
+    "anchor": "[[anchor]] sections, with two brackets",
+    "robot": "[[robot]] sections, with two brackets",
+    "marker": "at least one [[robot.marker]] section, with two brackets",
+    "imu": "a [robot.imu] section",
+    "filter": "a [robot.filter] section",
+    "host": 'an address to listen on, such as "127.0.0.1"',
+    "port": "a port number, 0 to 65535",
+    "pose_rate_hz": "poses a second, up to 1000",
+    "name": "a name of letters, digits, `_`, `-` and `.`, at most 64",
+    "calibration": "the path of the camera's calibration file, such as example-camera.toml beside example.toml",
+    "dictionary": 'the name of a marker dictionary, such as "4X4_50" or "APRILTAG_36H11"',
+    "width_px": "a whole number of pixels, 0 for the camera's own",
+    "height_px": "a whole number of pixels, 0 for the camera's own",
+    "frame_rate_hz": "frames a second, 0 for the camera's own",
+    "time_offset": "seconds, -2 to 2, added to the camera's stamps",
+    "id": "the number of the marker in its dictionary, 0 or more",
+    "size_mm": "the side of the marker's black square in millimetres, 5 to 2000",
+    "position_m": "three numbers [x, y, z] in metres, each within 1000",
+    "yaw_deg": "an angle in degrees, anticlockwise, -360 to 360",
+    "motion": '"ground", "differential" or "free"',
+    "engine": '"numba" or "filterpy"',
+    "protocol": '"json" or "csv"',
+    "baud": "the speed of the serial line in bits a second, such as 115200",
+}
+_SOURCE = {
+    "camera": 'a camera number, "/dev/video0", "rtsp://...", a video file, a folder of images or "picamera"',
+    "robot": '"websocket" or a serial port such as "/dev/ttyUSB0"',
+}
+
+
+def load(path: str | Path) -> Config:
+    """Read, decode and check a configuration file. Raises OSError, and ConfigError for what it says."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason} at byte {error.start})") from None
+    return parse(text, name=str(path), folder=path.parent)
+
+
+def parse(text: str, name: str = "configuration", folder: Path = Path()) -> Config:
+    """The same from a text. `name` stands for the file in errors; relative paths start at `folder`."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{name}: not valid TOML: {error}") from None
+    source = _Source(name, text, raw)
+    for path, value in _leaves(raw):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise source.error(path, f"found {value}; needed: {_right(path)}")
+    try:
+        config = msgspec.convert(raw, Config)
+    except msgspec.ValidationError as error:
+        raise source.explain(str(error)) from None
+    _check(config, source)
+    return msgspec.structs.replace(config, camera=tuple(_with_absolute_paths(c, folder) for c in config.camera))
+
+
+def _with_absolute_paths(camera: CameraConfig, folder: Path) -> CameraConfig:
+    source = camera.source
+    if isinstance(source, str) and source != "picamera" and "://" not in source:
+        source = str((folder / source).absolute())
+    calibration = str((folder / camera.calibration).absolute())
+    return msgspec.structs.replace(camera, source=source, calibration=calibration)
+
+
+def _check(config: Config, source: _Source) -> None:
+    """What no type says: names, marker ids and serial ports are each used once."""
+    seen: dict[tuple[str, object], KeyPath] = {}
+
+    def once(kind: str, value: object, path: KeyPath) -> None:
+        before = seen.setdefault((kind, value), path)
+        if before != path:
+            raise source.error(path, f"{kind} {value} is used twice, first by {source.words(before[:-1])}")
+
+    for i, camera in enumerate(config.camera):
+        once("the camera name", camera.name, ("camera", i, "name"))
+    for i, anchor in enumerate(config.anchor):
+        once("the marker id", anchor.id, ("anchor", i, "id"))
+    for i, robot in enumerate(config.robot):
+        once("the robot name", robot.name, ("robot", i, "name"))
+        for j, marker in enumerate(robot.marker):
+            once("the marker id", marker.id, ("robot", i, "marker", j, "id"))
+        if robot.imu.source != "websocket":
+            once("the serial port", robot.imu.source, ("robot", i, "imu", "source"))
+    if config.camera and not config.anchor:
+        raise source.error(
+            ("camera",),
+            "cameras need anchors: at least one [[anchor]], a marker on the floor at a known place (id, size_mm, "
+            "position_m), tells where the camera is",
+        )
+
+
+class _Source:
+    """The text behind a configuration, to say where in it something is."""
+
+    def __init__(self, name: str, text: str, raw: dict[str, Any]) -> None:
+        self.name = name
+        self.raw = raw
+        self.lines = _line_numbers(text)
+
+    def error(self, path: KeyPath, what: str) -> ConfigError:
+        found = next((self.lines[path[:n]] for n in range(len(path), 0, -1) if path[:n] in self.lines), None)
+        where = self.name if found is None else f"{self.name}, line {found}"
+        return ConfigError(f"{where}: {self.words(path)}: {what}" if path else f"{where}: {what}")
+
+    def words(self, path: KeyPath) -> str:
+        """`robot "rover", marker 7, size_mm`."""
+        parts: list[str] = []
+        value: Any = self.raw
+        for key in path:
+            try:
+                value = value[key]
+            except (KeyError, IndexError, TypeError):
+                value = None
+            if isinstance(key, str):
+                parts.append(key)
+            elif isinstance(value, dict):
+                label = value.get("name", value.get("id"))
+                parts[-1] += f" number {key + 1}" if label is None else f" {json.dumps(label, default=str)}"
+            else:
+                parts[-1] += f"[{key}]"
+        return ", ".join(parts)
+
+    def explain(self, message: str) -> ConfigError:
+        """msgspec's message in words. Its forms: `... - at `$.camera[0].source``, unknown field, missing field."""
+        what, _, place = message.partition(" - at `$")
+        path: KeyPath = tuple(int(index) if index else key for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", place))
+        if unknown := re.search(r"unknown field `(.*)`", what):
+            return self._unknown(path, unknown[1])
+        if missing := re.search(r"missing required field `(.*)`", what):
+            return self.error(path, f'the key "{missing[1]}" is missing: {_right((*path, missing[1]))}')
+        value: Any = self.raw
+        for key in path:
+            value = value[key]
+        return self.error(path, f"found {_shown(value)}; needed: {_right(path) or what}")
+
+    def _unknown(self, path: KeyPath, key: str) -> ConfigError:
+        known = _fields(path)
+        nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+        if nearest:
+            right = _right((*path, nearest[0]))
+            advice = f'did you mean "{nearest[0]}"' + (f" ({right})?" if right else "?")
+        else:
+            advice = f"known here: {', '.join(known)}"
+        return self.error((*path, key), f"unknown key; {advice}")
+
+
+def _fields(path: KeyPath) -> tuple[str, ...]:
+    """The keys known in the section at `path`."""
+    names = tuple(key for key in path if isinstance(key, str))
+    section: dict[tuple[str, ...], type[Struct]] = {
+        (): Config,
+        ("server",): ServerConfig,
+        ("camera",): CameraConfig,
+        ("anchor",): AnchorConfig,
+        ("robot",): RobotConfig,
+        ("robot", "marker"): MarkerConfig,
+        ("robot", "imu"): ImuConfig,
+        ("robot", "filter"): FilterParams,
+    }
+    return section[names].__struct_fields__
+
+
+def _right(path: KeyPath) -> str:
+    names = [key for key in path if isinstance(key, str)]
+    if names[-1:] == ["source"]:
+        return _SOURCE.get(names[0], "")
+    if "filter" in names[:-1]:
+        return "a number in SI units, of the range that fusion/params.py gives"
+    return _RIGHT.get(names[-1], "") if names else ""
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _leaves(value: object, path: KeyPath = ()) -> Iterator[tuple[KeyPath, object]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _leaves(item, (*path, key))
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _leaves(item, (*path, i))
+    else:
+        yield path, value
+
+
+_HEADER = re.compile(r"""^\s*(\[\[?)\s*([\w."' -]+?)\s*\]\]?\s*(?:#.*)?$""")
+_KEY = re.compile(r"""^\s*([\w."'-]+)\s*=""")
+
+
+def _line_numbers(text: str) -> dict[KeyPath, int]:
+    """Path -> line of the sections and keys of a TOML text.
+
+    tomllib keeps no places; this reads the plain way of writing them and may miss others, which costs the number only.
+    """
+    lines: dict[KeyPath, int] = {}
+    count: dict[KeyPath, int] = {}
+    section: KeyPath = ()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.match(line):
+            section = ()
+            keys = [key.strip(" \"'") for key in header[2].split(".")]
+            for depth, key in enumerate(keys):
+                section = (*section, key)
+                if header[1] == "[[" and depth == len(keys) - 1:
+                    count[section] = count.get(section, -1) + 1
+                if section in count:
+                    lines.setdefault(section, number)
+                    section = (*section, count[section])
+            lines.setdefault(section, number)
+        elif key_match := _KEY.match(line):
+            path = (*section, *(key.strip("\"'") for key in key_match[1].split(".")))
+            lines.setdefault(path, number)
+    return lines

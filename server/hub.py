@@ -1,0 +1,89 @@
+"""Fan-out to many clients: each gets the newest message of each topic at its own rate, and none can hold up another.
+
+A message for a client that has not taken the earlier ones is dropped, not queued: what it misses, the next message
+says better. A client that takes nothing at all for `STALL_LIMIT` is cut off. (Keepalive would not do it: it waits in
+drain, behind the very buffer that does not empty.)
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+
+# Seconds without any progress after which a client is cut off.
+STALL_LIMIT = 5.0
+
+
+@dataclass(eq=False, slots=True)
+class Subscription:
+    """One client. `write` puts a message into its buffer at once; `room`: bytes that may wait before messages drop."""
+
+    transport: asyncio.WriteTransport
+    write: Callable[[bytes], None]
+    topics: frozenset[str]
+    interval: float
+    room: int
+    due: float = 0.0
+    stalled_since: float | None = None
+
+
+@dataclass
+class Hub:
+    """All clients. Time is an argument: s of one monotonic clock."""
+
+    subscriptions: list[Subscription] = field(default_factory=list)
+    dropped: int = 0
+    cut_off: int = 0
+
+    def subscribe(
+        self,
+        transport: asyncio.WriteTransport,
+        write: Callable[[bytes], None],
+        topics: Collection[str] = (),
+        rate_hz: float = 0.0,
+        room: int = 0,
+    ) -> Subscription:
+        """`rate_hz` 0: every message. `room` 0: strictly the latest, nothing is added to what has not left yet."""
+        interval = 1.0 / rate_hz if rate_hz > 0.0 else 0.0
+        subscription = Subscription(transport, write, frozenset(topics), interval, room)
+        self.subscriptions.append(subscription)
+        return subscription
+
+    def unsubscribe(self, subscription: Subscription) -> None:
+        self.subscriptions.remove(subscription)
+
+    def wants(self, topic: str) -> bool:
+        return any(topic in subscription.topics for subscription in self.subscriptions)
+
+    def publish(self, now: float, messages: Mapping[str, bytes]) -> None:
+        """`messages`: topic -> one encoded message. Those of one call count as one for the clients' rates."""
+        for subscription in self.subscriptions:
+            wanted = subscription.topics & messages.keys()
+            # A millisecond early is in time: a tick that is due at the same moment must not be missed by rounding.
+            if not wanted or now < subscription.due - 1e-3:
+                continue
+            if subscription.transport.get_write_buffer_size() > subscription.room:
+                self.dropped += len(wanted)
+                continue
+            # On schedule, so that 25 Hz out of 60 Hz is 25 Hz on average; but no catching up after a pause.
+            due = subscription.due + subscription.interval
+            subscription.due = due if due > now else now + subscription.interval
+            for topic in messages:
+                if topic in wanted:
+                    subscription.write(messages[topic])
+
+    def sweep(self, now: float) -> list[Subscription]:
+        """Cut off the clients that have taken nothing for `STALL_LIMIT`, and return them. To be called regularly."""
+        stalled = []
+        for subscription in self.subscriptions:
+            if subscription.transport.get_write_buffer_size() <= subscription.room:
+                subscription.stalled_since = None
+            elif subscription.stalled_since is None:
+                subscription.stalled_since = now
+            elif now - subscription.stalled_since > STALL_LIMIT:
+                stalled.append(subscription)
+        for subscription in stalled:
+            self.cut_off += 1
+            subscription.transport.abort()
+        return stalled
