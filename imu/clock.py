@@ -1,0 +1,216 @@
+"""Device time to host time, from nothing but stamps that arrive late.
+
+A sample that the device stamped `d` arrives at `host(d) + delay`, and `delay` has a minimum that is met again and
+again. A straight line under all points (d, arrival), touching them, is therefore the device's clock plus that minimum
+delay: V. Paxson, "On calibrating measurements of packet transit times" (SIGMETRICS 1998); the line is the edge of the
+lower convex hull under the middle of the window: S. Moon, P. Skelly, D. Towsley, "Estimation and removal of clock
+skew from network delay measurements" (INFOCOM 1999). What is left, the minimum delay itself, is removed by the
+four-timestamp exchange of NTP (RFC 5905, section 8) where the device answers one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from fusion.measurements import Array
+
+# s of device time in one bucket, of which only the earliest arrival is kept, and buckets in the window.
+BUCKET = 1.0
+WINDOW = 60
+# s: the slope is believed in full only over a window much longer than this; until then the last one known counts.
+SLOPE_SPAN = 10.0
+# Largest skew: a crystal has 1e-4, the RC oscillator of a microcontroller 2e-2.
+MAX_SKEW = 0.03
+# s: a device clock that runs back, or ahead of its line, by more has jumped.
+JUMP = 0.03
+# s: arrivals that are later than the line by more, without a single better one for LATE_FOR, mean a jump as well (a
+# device that slept and whose clock stood still); less is a network having a bad time.
+LATE = 0.25
+LATE_FOR = 2.0
+# Round trips kept, and by how much (s per s of age) an older one is trusted less: the error of the slope.
+EXCHANGES = 64
+AGEING = 1e-5
+# s: the distance between samples that arrive together and bring no stamps, where nothing better is known because the
+# one before came longer ago than this for each of them.
+UNSTAMPED_SPACING = 1e-3
+UNSTAMPED_PAUSE = 0.1
+# s: what is put between two stamps that would fall together or back.
+MONOTONE_STEP = 1e-6
+
+
+class _Exchange(NamedTuple):
+    device: float
+    host: float
+    round_trip: float
+
+
+class DeviceClock:
+    """Maps one device's clock to the host's. No I/O: arrival times are arguments, host monotonic s.
+
+    `restarts` counts the jumps and reboots of the device's clock that were seen. `skew` is the slope of the mapping
+    less one: positive where the device's clock is slow. `minimum_delay`: s, by the best round trip; None without one.
+    """
+
+    def __init__(self) -> None:
+        self.restarts = 0
+        self.skew = 0.0
+        self._last_stamp = -math.inf
+        self._last_arrival = -math.inf
+        self._forget()
+
+    def _forget(self) -> None:
+        """Start again with the next point; the skew is the oscillator's and outlives a reboot."""
+        self._origin: tuple[float, float] | None = None
+        # (x, y) of the earliest arrival in each bucket: x device time since the origin, y arrival since the origin - x
+        self._buckets: deque[tuple[float, float]] = deque(maxlen=WINDOW)
+        self._bucket = 0
+        self._offset = 0.0
+        self._newest = -math.inf
+        self._suspect = False
+        self._late_since = math.inf
+        self._exchanges: deque[_Exchange] = deque(maxlen=EXCHANGES)
+        self._best: _Exchange | None = None
+
+    @property
+    def minimum_delay(self) -> float | None:
+        return None if self._best is None else max(0.0, self._line(self._best.device) - self._best.host)
+
+    def observe(self, device_time: float, arrival: float) -> None:
+        """A sample that the device stamped reached the host at `arrival`. Samples come in the order they were taken."""
+        self._observe(device_time, arrival, back=device_time < self._newest - JUMP)
+        if not self._suspect:
+            self._newest = max(self._newest, device_time)
+
+    def _observe(self, device_time: float, arrival: float, *, back: bool = False) -> None:
+        if self._origin is None:
+            self._origin = (device_time, arrival)
+            self._buckets.append((0.0, 0.0))
+            return
+        excess = arrival - self._line(device_time)
+        if back or excess < -JUMP:
+            # One alone may be a broken number; a second in a row is not.
+            if self._suspect:
+                self._restart(device_time, arrival)
+            else:
+                self._suspect = True
+            return
+        self._suspect = False
+        if excess <= LATE:
+            self._late_since = math.inf
+        elif self._late_since == math.inf:
+            self._late_since = arrival
+        elif arrival - self._late_since > LATE_FOR:
+            self._restart(device_time, arrival)
+            return
+        x = device_time - self._origin[0]
+        y = arrival - self._origin[1] - x
+        if x // BUCKET > self._bucket:
+            self._fit()
+            self._bucket = int(x // BUCKET)
+            self._buckets.append((x, y))
+        elif x // BUCKET == self._bucket and y < self._buckets[-1][1]:
+            self._buckets[-1] = (x, y)
+        # Never above a point: no stamp may lie after its arrival.
+        self._offset = min(self._offset, y - self.skew * x)
+
+    def exchange(self, sent: float, received_device: float, sent_device: float, arrival: float) -> None:
+        """The host sent at `sent`, the device received and answered by its own clock, the answer came at `arrival`."""
+        # Not `observe`: samples that were waiting for their batch to fill follow, and are older.
+        self._observe(sent_device, arrival)
+        round_trip = (arrival - sent) - (sent_device - received_device)
+        if round_trip < 0.0 or sent_device < received_device or self._suspect:
+            return
+        self._exchanges.append(_Exchange(0.5 * (received_device + sent_device), 0.5 * (sent + arrival), round_trip))
+        self._choose()
+
+    def to_host(self, device_time: float) -> float:
+        """Host time of `device_time`; of a stamp that was observed never later than its arrival.
+
+        nan before the first observation.
+        """
+        delay = self.minimum_delay
+        return self._line(device_time) - (delay or 0.0)
+
+    def to_device(self, t: float) -> float:
+        """The device's time at host time `t`, the inverse of `to_host`; nan before the first observation."""
+        if self._origin is None:
+            return math.nan
+        line = t + (self.minimum_delay or 0.0)
+        return self._origin[0] + (line - self._origin[1] - self._offset) / (1.0 + self.skew)
+
+    def stamp(self, device_times: Sequence[float | None], arrival: float) -> Array:
+        """Host times (n,) of samples that arrived together, oldest first; None where the device gave no time.
+
+        They rise from sample to sample, also over calls, and none is later than `arrival` (where both cannot be, at a
+        jump of the device's clock, the second holds). Samples without a device time are spread evenly over the time
+        since the last arrival: all that is known of them.
+        """
+        for device_time in device_times:
+            if device_time is not None:
+                self.observe(device_time, arrival)
+        n = len(device_times)
+        spacing = (arrival - self._last_arrival) / max(1, n)
+        if not spacing < UNSTAMPED_PAUSE:
+            spacing = UNSTAMPED_SPACING
+        stamps = np.empty(n)
+        for i, device_time in enumerate(device_times):
+            t = arrival - (n - 1 - i) * spacing if device_time is None else self.to_host(device_time)
+            self._last_stamp = min(max(t, self._last_stamp + MONOTONE_STEP), arrival)
+            stamps[i] = self._last_stamp
+        self._last_arrival = arrival
+        return stamps
+
+    def _line(self, device_time: float) -> float:
+        """The line under the arrivals, host s."""
+        if self._origin is None:
+            return math.nan
+        x = device_time - self._origin[0]
+        return self._origin[1] + x + self._offset + self.skew * x
+
+    def _restart(self, device_time: float, arrival: float) -> None:
+        self.restarts += 1
+        self._forget()
+        self._newest = device_time
+        self._observe(device_time, arrival)
+
+    def _fit(self) -> None:
+        """Slope and offset from the buckets of the window."""
+        points = self._buckets
+        span = points[-1][0] - points[0][0]
+        if span > 0.0:
+            # Shrunk towards the last slope: over a short window the hull's slope is mostly the scatter of the delays.
+            weight = span * span / (span * span + SLOPE_SPAN * SLOPE_SPAN)
+            slope = self.skew + weight * (_hull_slope(points) - self.skew)
+            self.skew = min(max(slope, -MAX_SKEW), MAX_SKEW)
+        self._offset = min(y - self.skew * x for x, y in points)
+        self._choose()
+
+    def _choose(self) -> None:
+        newest = self._newest
+        self._best = min(self._exchanges, key=lambda e: e.round_trip + AGEING * (newest - e.device), default=None)
+
+
+def _hull_slope(points: Sequence[tuple[float, float]]) -> float:
+    """Slope of the lower convex hull's edge under the middle of `points`, which are sorted by x.
+
+    Of all lines below the points this edge has the least sum of distances to them (for evenly spread x).
+    """
+    hull: list[tuple[float, float]] = []
+    for x, y in points:
+        while len(hull) > 1:
+            (x0, y0), (x1, y1) = hull[-2:]
+            if (y1 - y0) * (x - x1) < (y - y1) * (x1 - x0):
+                break
+            hull.pop()
+        hull.append((x, y))
+    middle = 0.5 * (points[0][0] + points[-1][0])
+    for (x0, y0), (x1, y1) in pairwise(hull):
+        if x1 >= middle:
+            return (y1 - y0) / (x1 - x0)
+    return 0.0
