@@ -44,6 +44,10 @@ UNSTAMPED_PAUSE = 0.1
 MONOTONE_STEP = 1e-6
 
 
+# The fields of an `imu.protocols.RawSample`, which is one.
+Reading = tuple[float | None, float, float, float, float, float, float]
+
+
 class _Exchange(NamedTuple):
     device: float
     host: float
@@ -144,27 +148,27 @@ class DeviceClock:
         line = t + (self.minimum_delay or 0.0)
         return self._origin[0] + (line - self._origin[1] - self._offset) / (1.0 + self.skew)
 
-    def stamp(self, device_times: Sequence[float | None], arrival: float) -> Array:
-        """Host times (n,) of samples that arrived together, oldest first; None where the device gave no time.
+    def stamp(self, samples: Sequence[Reading], arrival: float) -> Array:
+        """Samples that arrived together, oldest first -> (n, 7), host time and readings, as an `ImuBatch` takes them.
 
-        They rise from sample to sample, also over calls, and none is later than `arrival` (where both cannot be, at a
-        jump of the device's clock, the second holds). Samples without a device time are spread evenly over the time
+        Stamps rise from sample to sample, also over calls, and none is later than `arrival` (where both cannot be, at
+        a jump of the device's clock, the second holds). Samples without a device time are spread evenly over the time
         since the last arrival: all that is known of them.
         """
-        for device_time in device_times:
+        for device_time, *_ in samples:
             if device_time is not None:
                 self.observe(device_time, arrival)
-        n = len(device_times)
+        n = len(samples)
         spacing = (arrival - self._last_arrival) / max(1, n)
         if not spacing < UNSTAMPED_PAUSE:
             spacing = UNSTAMPED_SPACING
-        stamps = np.empty(n)
-        for i, device_time in enumerate(device_times):
+        stamped = np.empty((n, 7))
+        for i, (device_time, *readings) in enumerate(samples):
             t = arrival - (n - 1 - i) * spacing if device_time is None else self.to_host(device_time)
             self._last_stamp = min(max(t, self._last_stamp + MONOTONE_STEP), arrival)
-            stamps[i] = self._last_stamp
+            stamped[i] = self._last_stamp, *readings
         self._last_arrival = arrival
-        return stamps
+        return stamped
 
     def _line(self, device_time: float) -> float:
         """The line under the arrivals, host s."""
