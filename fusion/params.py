@@ -62,6 +62,24 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     hypothesis_margin: NotNegative = 4.0
     """score by which one pose of a flat marker must beat the other to be believed with its tilt."""
 
+    reinit_gate: Positive = 16.81
+    """chi-square .99 at 6 degrees of freedom: rejected fixes whose d2 to each other, through the IMU, is below agree."""
+    reinit_count: Annotated[int, Meta(ge=2)] = 3
+    """that many rejects in a row that agree set the pose anew, if their attitude also agrees with the gyro."""
+    reinit_patience: Positive = 15.0
+    """s: after that long they do even if it does not. Longer than a wrong map entry is in view (8-10 s measured)."""
+
+    ground_velocity_sigma: Positive = 0.05
+    """m/s: vertical speed of a robot on the floor, ten times a second."""
+    ground_tilt_sigma: Positive = 0.05
+    """rad: its roll and pitch, likewise; more than it is, since successive ones are the same error."""
+    wheel_velocity_sigma: Positive = 0.05
+    """m/s: sideways speed of a robot on wheels, ten times a second."""
+    no_imu_accel_noise: Positive = 1.0
+    """m/s2/sqrt(Hz): how a robot without IMU data may change its velocity."""
+    no_imu_rate_noise: Positive = 0.5
+    """rad/s/sqrt(Hz): how it may turn."""
+
     buffer: Positive = 2.0
     """s: how late a measurement may come and still be put in its place."""
     imu_gap: Positive = 0.2

@@ -1,0 +1,179 @@
+"""One robot: measurements in, outcomes and poses out."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+
+from fusion import kernels as k
+from fusion.measurements import Array, FixOutcome, ImuBatch, Mode, Outcome, Pose, PoseFix
+from fusion.params import Engine, FilterParams, Motion
+from fusion.timeline import Timeline, fix_row
+
+
+class _Timeline(Protocol):
+    state: Array
+
+    def feed_samples(self, samples: Array, track: Array | None = None) -> int: ...
+    def feed_fix(self, row: Array) -> int: ...
+    def judged(self) -> list[Array]: ...
+    def pose_at(self, t: float) -> Array | None: ...
+    @property
+    def figures(self) -> dict[str, int]: ...
+
+
+def _timeline(engine: Engine, params: FilterParams, motion: Motion) -> _Timeline:
+    if engine == "filterpy":
+        # Imported here: the compiled engine needs neither filterpy nor what it brings, and starts faster without.
+        from fusion.reference import ReferenceTimeline
+
+        return ReferenceTimeline(params, motion)
+    return Timeline(params, motion)
+
+
+def warm_up(engine: Engine = "numba") -> None:
+    """Compile the kernels, or load them from numba's cache, before the first measurement needs them."""
+    localiser = Localiser("warm-up", engine=engine)
+    localiser.feed_samples(np.zeros((1, 7)))
+    localiser.pose_at(0.0)
+    localiser._timeline.feed_fix(np.zeros(k.FIX))
+
+
+class Localiser:
+    """The pose of one robot, from its IMU and from fixes in any order of arrival.
+
+    `motion`: "ground" for a robot on the floor (no vertical speed, upright), "differential" for one on wheels that
+    cannot move sideways either, "free" for a flying or hand-held one. `engine`: "numba", or "filterpy" for the same
+    model without a compiler. Not safe to be used from several threads at once.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        params: FilterParams | None = None,
+        motion: Motion = "ground",
+        engine: Engine = "numba",
+    ) -> None:
+        self.robot = robot
+        self.params = params or FilterParams()
+        self.motion = motion
+        self._timeline = _timeline(engine, self.params, motion)
+        self._outcomes = dict.fromkeys(Outcome, 0)
+        self._samples = 0
+        self._sources: dict[tuple[float, float], str] = {}
+
+    def feed(self, measurement: ImuBatch | PoseFix) -> list[FixOutcome]:
+        """Take a measurement. -> the fixes that were judged by this call.
+
+        That is usually the fix just fed, or none; a fix stamped later than all IMU data so far is judged when they
+        have come. Late, repeated and unbelievable measurements are outcomes and counts, never exceptions.
+        """
+        if isinstance(measurement, ImuBatch):
+            self.feed_samples(measurement.samples)
+        else:
+            status = self._timeline.feed_fix(fix_row(measurement))
+            if status != k.PENDING:
+                outcome = Outcome(status)
+                self._outcomes[outcome] += 1
+                return [FixOutcome(self.robot, measurement.t, measurement.arrival, outcome, source=measurement.source)]
+            self._sources[measurement.t, measurement.arrival] = measurement.source
+        return self.judged()
+
+    def feed_samples(self, samples: Array, track: Array | None = None) -> None:
+        """IMU samples (n, 7) as in `ImuBatch`, unchecked.
+
+        `track` (n, 8) receives the pose as it is known when each sample has arrived: t, position, quaternion wxyz,
+        NaN before the first fix.
+        """
+        self._samples += len(samples)
+        self._timeline.feed_samples(samples, track)
+
+    def judged(self) -> list[FixOutcome]:
+        """The fixes judged since this was last asked; `feed` asks by itself."""
+        outcomes = [self._outcome(row) for row in self._timeline.judged()]
+        for outcome in outcomes:
+            self._outcomes[outcome.outcome] += 1
+        return outcomes
+
+    def _outcome(self, row: Array) -> FixOutcome:
+        t, arrival = float(row[k.F_T]), float(row[k.F_ARRIVAL])
+        return FixOutcome(
+            robot=self.robot,
+            t=t,
+            arrival=arrival,
+            outcome=Outcome(int(row[k.F_OUTCOME])),
+            d2=float(row[k.F_D2]),
+            d2_position=float(row[k.F_D2_POSITION]),
+            d2_attitude=float(row[k.F_D2_ATTITUDE]),
+            innovation=row[k.F_INNOVATION : k.F_INNOVATION + 6],
+            innovation_sigma=row[k.F_SIGMA : k.F_SIGMA + 6],
+            hypothesis=0 if math.isnan(row[k.F_CHOSEN]) else int(row[k.F_CHOSEN]),
+            margin=float(row[k.F_MARGIN]),
+            source=self._sources.pop((t, arrival), ""),
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Fixes by outcome, and of IMU samples those fed, those dropped as repeated and as late; rewinds."""
+        return (
+            {outcome.name.lower(): n for outcome, n in self._outcomes.items() if outcome is not Outcome.PENDING}
+            | {"imu_samples": self._samples}
+            | self._timeline.figures
+        )
+
+    @property
+    def started(self) -> bool:
+        """Whether there has been a fix to start from."""
+        return bool(self._timeline.state[k.INITIALISED])
+
+    @property
+    def latest(self) -> Pose | None:
+        """The pose at the newest instant that measurements have been taken for; None before the first fix."""
+        return self.pose_at(float(self._timeline.state[k.T]))
+
+    @property
+    def gyro_bias(self) -> Array:
+        """(3,) rad/s, body axes."""
+        return self._timeline.state[k.BG : k.BG + 3].copy()
+
+    @property
+    def accel_bias(self) -> Array:
+        """(3,) m/s2, body axes."""
+        return self._timeline.state[k.BA : k.BA + 3].copy()
+
+    def pose_at(self, t: float) -> Pose | None:
+        """The pose at instant t: of the past as far as the buffer reaches, or extrapolated into the near future.
+
+        None before the first fix and before the buffer.
+        """
+        row = self._timeline.pose_at(t)
+        if row is None:
+            return None
+        covariance = row[k.P_COV : k.P_COV + 36].reshape(6, 6)
+        fix_age = t - float(row[k.P_T_ACCEPTED])
+        return Pose(
+            robot=self.robot,
+            t=t,
+            position=row[k.P_POS : k.P_POS + 3],
+            quaternion_wxyz=row[k.P_QUAT : k.P_QUAT + 4],
+            velocity=row[k.P_VEL : k.P_VEL + 3],
+            angular_velocity=row[k.P_RATE : k.P_RATE + 3],
+            covariance=covariance,
+            velocity_covariance=row[k.P_VCOV : k.P_VCOV + 9].reshape(3, 3),
+            mode=self._mode(fix_age, t - float(row[k.P_T_IMU]), covariance),
+            reset_id=int(row[k.P_RESET_ID]),
+            fix_age=fix_age,
+        )
+
+    def _mode(self, fix_age: float, imu_age: float, covariance: Array) -> Mode:
+        coasting = fix_age > self.params.coast_after
+        if imu_age > self.params.imu_gap:
+            return Mode.LOST if coasting else Mode.NO_IMU
+        if not coasting:
+            return Mode.FULL
+        sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        if sigma > self.params.invalid_sigma:
+            return Mode.INVALID
+        return Mode.DEGRADED if sigma > self.params.degraded_sigma else Mode.COAST

@@ -1,0 +1,94 @@
+"""One robot's measurements in the order in which they happened, on the compiled kernels.
+
+`Timeline` owns the memory that `fusion.kernels` works on; what it promises is described there. `fusion.reference`
+has the same interface on filterpy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion import kernels as k
+from fusion.measurements import Array, PoseFix
+from fusion.params import FilterParams, Motion
+
+MOTIONS: dict[Motion, float] = {"free": k.FREE, "ground": k.GROUND, "differential": k.DIFFERENTIAL}
+
+
+def parameter_vector(params: FilterParams, motion: Motion) -> Array:
+    """The parameters as the kernels take them: each in the place that its name has in `fusion.kernels`."""
+    vector = np.full(k.PARAMS, np.nan)
+    for name in FilterParams.__struct_fields__:
+        place = getattr(k, name.upper(), None)
+        if place is not None:
+            vector[place] = getattr(params, name)
+    vector[k.MOTION] = MOTIONS[motion]
+    return vector
+
+
+def fix_row(fix: PoseFix) -> Array:
+    """A fix as a row of the kernels' ring."""
+    row = np.zeros(k.FIX)
+    row[k.F_T], row[k.F_ARRIVAL], row[k.F_COUNT] = fix.t, fix.arrival, len(fix.hypotheses)
+    row[k.F_D2 : k.F_REPORTED] = np.nan
+    for i, hypothesis in enumerate(fix.hypotheses):
+        at = k.F_HYPOTHESES + i * k.HYPOTHESIS
+        row[at + k.H_POS : at + k.H_POS + 3] = hypothesis.position
+        row[at + k.H_QUAT : at + k.H_QUAT + 4] = hypothesis.quaternion_wxyz
+        row[at + k.H_COV : at + k.H_COV + 36] = hypothesis.covariance.ravel()
+        row[at + k.H_MISFIT] = hypothesis.misfit
+    return row
+
+
+class Timeline:
+    """Measurements in, in any order; the state after all of them out."""
+
+    def __init__(self, params: FilterParams, motion: Motion) -> None:
+        self._memory = np.zeros(k.MEMORY)
+        self._meta, vector, self.state, _, self._fixes, _ = k.views(self._memory)
+        vector[:] = parameter_vector(params, motion)
+        k.clear(self._memory)
+        self._no_track = np.zeros((0, 8))
+        self._waiting = 0  # fixes in the ring whose outcome has not been told
+
+    def feed_samples(self, samples: Array, track: Array | None = None) -> int:
+        """IMU samples (n, 7): t, gyro, accel. -> how many were neither duplicates nor older than the buffer.
+
+        `track` (n, 8) receives the pose after each sample, at its stamp: t, position, quaternion wxyz; NaN before
+        the first fix.
+        """
+        return int(k.feed_samples(self._memory, samples, self._no_track if track is None else track))
+
+    def feed_fix(self, row: Array) -> int:
+        """A fix as `fix_row` makes it. -> `kernels.PENDING`, `TOO_LATE` or `DUPLICATE`."""
+        status = int(k.feed_fix(self._memory, row))
+        if status == k.PENDING:
+            self._waiting += 1
+        return status
+
+    def judged(self) -> list[Array]:
+        """The rows of the fixes that have been judged since this was last asked, oldest stamp first."""
+        if not self._waiting:
+            return []
+        rows = []
+        for number in range(int(self._meta[k.FIX_FIRST]), int(self._meta[k.FIX_END])):
+            row = self._fixes[number % k.FIX_CAPACITY]
+            if row[k.F_OUTCOME] != k.PENDING and not row[k.F_REPORTED]:
+                row[k.F_REPORTED] = 1.0
+                rows.append(row.copy())
+        self._waiting -= len(rows)
+        return rows
+
+    def pose_at(self, t: float) -> Array | None:
+        """A pose (kernels.POSE,) for instant t; None before the first fix, or before the buffer."""
+        out = np.empty(k.POSE)
+        return out if k.pose_at(self._memory, t, out) else None
+
+    @property
+    def figures(self) -> dict[str, int]:
+        """How many IMU samples were seen twice, or came too late; how often the past was done again."""
+        return {
+            "imu_duplicates": int(self._meta[k.IMU_DUPLICATES]),
+            "imu_late": int(self._meta[k.IMU_LATE]),
+            "rewinds": int(self._meta[k.REWINDS]),
+        }
