@@ -7,8 +7,8 @@ drain, behind the very buffer that does not empty.)
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable, Collection, Mapping
+import contextlib
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 # Seconds without any progress after which a client is cut off.
@@ -17,10 +17,12 @@ STALL_LIMIT = 5.0
 
 @dataclass(eq=False, slots=True)
 class Subscription:
-    """One client. `write` puts a message into its buffer at once; `room`: bytes that may wait before messages drop."""
+    """One client. `write` puts a message into its buffer at once, `waiting` says how many bytes are in there, `abort`
+    ends the connection. `room`: bytes that may wait before messages are dropped."""
 
-    transport: asyncio.WriteTransport
     write: Callable[[bytes], None]
+    waiting: Callable[[], int]
+    abort: Callable[[], None]
     topics: frozenset[str]
     interval: float
     room: int
@@ -36,22 +38,24 @@ class Hub:
     dropped: int = 0
     cut_off: int = 0
 
-    def subscribe(
+    @contextlib.contextmanager
+    def subscribed(
         self,
-        transport: asyncio.WriteTransport,
         write: Callable[[bytes], None],
+        waiting: Callable[[], int],
+        abort: Callable[[], None],
         topics: Collection[str] = (),
         rate_hz: float = 0.0,
         room: int = 0,
-    ) -> Subscription:
+    ) -> Iterator[None]:
         """`rate_hz` 0: every message. `room` 0: strictly the latest, nothing is added to what has not left yet."""
         interval = 1.0 / rate_hz if rate_hz > 0.0 else 0.0
-        subscription = Subscription(transport, write, frozenset(topics), interval, room)
+        subscription = Subscription(write, waiting, abort, frozenset(topics), interval, room)
         self.subscriptions.append(subscription)
-        return subscription
-
-    def unsubscribe(self, subscription: Subscription) -> None:
-        self.subscriptions.remove(subscription)
+        try:
+            yield
+        finally:
+            self.subscriptions.remove(subscription)
 
     def wants(self, topic: str) -> bool:
         return any(topic in subscription.topics for subscription in self.subscriptions)
@@ -63,7 +67,7 @@ class Hub:
             # A millisecond early is in time: a tick that is due at the same moment must not be missed by rounding.
             if not wanted or now < subscription.due - 1e-3:
                 continue
-            if subscription.transport.get_write_buffer_size() > subscription.room:
+            if subscription.waiting() > subscription.room:
                 self.dropped += len(wanted)
                 continue
             # On schedule, so that 25 Hz out of 60 Hz is 25 Hz on average; but no catching up after a pause.
@@ -77,7 +81,7 @@ class Hub:
         """Cut off the clients that have taken nothing for `STALL_LIMIT`, and return them. To be called regularly."""
         stalled = []
         for subscription in self.subscriptions:
-            if subscription.transport.get_write_buffer_size() <= subscription.room:
+            if subscription.waiting() <= subscription.room:
                 subscription.stalled_since = None
             elif subscription.stalled_since is None:
                 subscription.stalled_since = now
@@ -85,5 +89,5 @@ class Hub:
                 stalled.append(subscription)
         for subscription in stalled:
             self.cut_off += 1
-            subscription.transport.abort()
+            subscription.abort()
         return stalled

@@ -1,0 +1,564 @@
+"""The service: one asyncio loop, one port, cameras and serial lines on threads of their own.
+
+Paths: WebSocket `/` (the original tracker's stream), `/v1/poses`, `/v1/robot`; GET `/` (a page), `/healthz`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import functools
+import http
+import itertools
+import logging
+import math
+import socket
+import time
+from collections.abc import Callable, Collection, Coroutine
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from email.utils import formatdate
+from importlib.metadata import version
+from importlib.resources import files
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import parse_qsl, urlsplit
+
+import msgspec
+from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+from websockets.http11 import Request, Response
+
+from fusion.localiser import warm_up
+from fusion.measurements import Pose
+from imu.protocols import TIME_LIMIT
+from imu.protocols.csv_lines import CsvLines
+from imu.protocols.json_lines import JsonLines
+from imu.protocols.lines import LineParser
+from imu.uart import SerialImu
+from server.cameras import FIRST_PAUSE, LONGEST_PAUSE, Camera, Open, Seen, open_configured
+from server.config import Config
+from server.hub import STALL_LIMIT, Hub
+from server.messages import (
+    ClockAnswer,
+    ClockQuestion,
+    Error,
+    Hello,
+    Imu,
+    MessageError,
+    Welcome,
+    decode,
+    encode,
+    raw_samples,
+)
+from server.robots import Recording, Robot
+
+log = logging.getLogger("steadfix")
+
+SERVICE = f"steadfix {version('steadfix')}"
+# A batch of 200 samples in full precision is 30 KiB.
+MAX_MESSAGE = 64 * 1024
+# Bytes of the original stream that may wait for a client: there each message counts, so some may.
+TRACKER_ROOM = 64 * 1024
+# s without a word after which a robot's connection is taken for dead, and another may take its place.
+SILENCE = 3.0
+# s between clock questions, for the first ones and then.
+CLOCK_FAST, CLOCK_FAST_COUNT, CLOCK_SLOW = 0.1, 10, 1.0
+# s that closing may take: for clients that do not answer, and for threads that hang in a driver.
+CLOSE_TIMEOUT = 0.7
+
+_PAGE = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/dashboard.css": ("dashboard.css", "text/css; charset=utf-8"),
+    "/dashboard.js": ("dashboard.js", "text/javascript; charset=utf-8"),
+    "/favicon.svg": ("favicon.svg", "image/svg+xml"),
+}
+_WEBSOCKETS = ("/", "/v1/poses", "/v1/robot")
+_THERE_IS = (
+    "There is:\n"
+    "  GET        /           the page that shows the robots\n"
+    "  GET        /healthz    health, as JSON\n"
+    "  WebSocket  /v1/poses   poses; ?robots=a,b&rate=50\n"
+    "  WebSocket  /v1/robot   for a robot: IMU up, its pose down\n"
+    "  WebSocket  /           marker sightings, as the original tracker sent them\n"
+)
+_MODES = {
+    "INIT": "no fix yet",
+    "COAST": "no fix for a while, the IMU alone",
+    "DEGRADED": "too long without a fix to steer by",
+    "INVALID": "too long without a fix to be good for anything",
+    "NO_IMU": "no IMU data, fixes alone",
+    "LOST": "neither fixes nor IMU data",
+}
+
+
+class RefusedError(Exception):
+    """A client that cannot be served. The text is what it is told before its connection is closed."""
+
+
+@dataclass(eq=False)
+class _Visitor:
+    """One connection: what it was refused, for the log and the health."""
+
+    connection: ServerConnection
+    name: str
+    refused: int = 0
+
+    @classmethod
+    def of(cls, connection: ServerConnection, path: str) -> _Visitor:
+        address = connection.remote_address
+        return cls(connection, f"{path} from {address[0]}:{address[1]}" if isinstance(address, tuple) else path)
+
+
+@dataclass(eq=False)
+class _Link:
+    """A robot's connection. `questions`: clock questions on the way, id -> when they were sent."""
+
+    connection: ServerConnection
+    heard: float
+    questions: dict[int, float] = field(default_factory=dict)
+
+
+class Service:
+    """`async with Service(config) as service:` runs it; then `service.port` is the port that it listens on.
+
+    `recording` gets all inputs, `published` each pose. `failed` is a future that a fault in the background ends.
+    Raises OSError in words when the port cannot be had, and what `Camera` raises.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        recording: Recording | None = None,
+        open_camera: Open = open_configured,
+        published: Callable[[Pose], None] | None = None,
+    ) -> None:
+        self.config = config
+        self.hub = Hub()
+        self.robots = {robot.name: Robot(robot, recording) for robot in config.robot}
+        self.cameras = {
+            camera.name: Camera(camera, config, self._deliver, lambda: self.hub.wants("tracker"), open_camera)
+            for camera in config.camera
+        }
+        self.refused = 0
+        self.port = 0
+        # Set once the filters' kernels are compiled; what comes before is not fed.
+        self.ready = asyncio.Event()
+        self._links: dict[str, _Link] = {}
+        self._started = time.monotonic()
+        self._published = published
+        self._page = {
+            path: (files("server").joinpath("dashboard", name).read_bytes(), kind)
+            for path, (name, kind) in _PAGE.items()
+        }
+        self._loop = asyncio.get_running_loop()
+        self._server: Server | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.failed: asyncio.Future[None] = self._loop.create_future()
+
+    async def __aenter__(self) -> Self:
+        host, port = self.config.server.host, self.config.server.port
+        try:
+            self._server = await serve(
+                self._serve,
+                host,
+                port,
+                process_request=self._answer,
+                compression=None,
+                max_size=MAX_MESSAGE,
+                close_timeout=CLOSE_TIMEOUT,
+                server_header=None,
+            )
+        except OSError as error:
+            raise _words(error, host, port) from None
+        self.port = self._server.sockets[0].getsockname()[1]
+        if host not in ("127.0.0.1", "localhost", "::1"):
+            log.warning("listening on %s: anyone on this network can see the robots and speak for them", host)
+        for camera in self.cameras.values():
+            camera.start()
+        self._spawn(self._warm_up())
+        self._spawn(self._publish())
+        for robot in self.robots.values():
+            if robot.config.imu.source != "websocket":
+                self._spawn(self._read_serial(robot))
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for camera in self.cameras.values():
+            camera.stop()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._server is not None:
+            self._server.close(code=CloseCode.GOING_AWAY, reason="the service is ending")
+            await self._server.wait_closed()
+        await asyncio.gather(*(asyncio.to_thread(camera.join, CLOSE_TIMEOUT) for camera in self.cameras.values()))
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run in the background; if it fails, which nothing here should, the service fails instead of limping on."""
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+
+        def done(task: asyncio.Task[None]) -> None:
+            self._tasks.discard(task)
+            if not task.cancelled() and (error := task.exception()) is not None and not self.failed.done():
+                self.failed.set_exception(error)
+
+        task.add_done_callback(done)
+
+    async def _warm_up(self) -> None:
+        engines = {robot.config.engine for robot in self.robots.values()}
+        begun = time.monotonic()
+        work = asyncio.gather(*(asyncio.to_thread(warm_up, engine) for engine in engines))
+        # Loading takes a moment, compiling a while: only that needs an explanation.
+        await asyncio.wait([work], timeout=3.0)
+        if not work.done():
+            log.info("compiling the filters; this happens once after each update and may take a minute")
+        await work
+        log.debug("the filters were ready after %.1f s", time.monotonic() - begun)
+        self.ready.set()
+
+    # Inputs
+
+    def _deliver(self, seen: Seen) -> None:
+        """From a camera's thread."""
+        self._call_from_thread(self._seen, seen)
+
+    def _call_from_thread(self, function: Callable[..., None], *arguments: object) -> None:
+        # The loop may be closed while a thread still ends: nobody needs what it brings then.
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    def _seen(self, seen: Seen) -> None:
+        now = time.monotonic()
+        for message in seen.tracker:
+            self.hub.publish(now, {"tracker": message})
+        if self.ready.is_set():
+            for fix in seen.fixes:
+                self.robots[fix.robot].feed_fix(fix, now)
+
+    async def _read_serial(self, robot: Robot) -> None:
+        """Read a robot's serial port, and open it again whenever it is lost."""
+        pause = FIRST_PAUSE
+        while True:
+            heard = robot.heard
+            try:
+                await self._read_port(robot)
+            except (OSError, ValueError) as error:
+                if robot.trouble != str(error):
+                    log.warning("robot %s: %s; trying again until it works", robot.config.name, error)
+                robot.trouble = str(error)
+            pause = FIRST_PAUSE if robot.heard > heard else pause
+            await asyncio.sleep(pause)
+            pause = min(2.0 * pause, LONGEST_PAUSE)
+
+    async def _read_port(self, robot: Robot) -> None:
+        """The same until the port is lost (OSError) or cannot be opened (OSError, ValueError for the baud rate)."""
+        name, imu = robot.config.name, robot.config.imu
+        parser: LineParser = CsvLines() if imu.protocol == "csv" else JsonLines()
+        lost: asyncio.Future[None] = self._loop.create_future()
+
+        def read(data: bytes, arrival: float) -> None:
+            dropped = parser.dropped
+            samples = parser.feed(data)
+            if parser.dropped > dropped:
+                if dropped == 0:
+                    log.warning("robot %s: %s: %s", name, imu.source, parser.last_error)
+                robot.dropped += parser.dropped - dropped
+                robot.trouble = f"it sends what cannot be used: {parser.last_error}"
+            if self.ready.is_set():
+                robot.feed_imu(samples, arrival)
+
+        def end(error: OSError) -> None:
+            if not lost.done():
+                lost.set_exception(error)
+
+        from_thread = self._call_from_thread
+        port = await asyncio.to_thread(
+            SerialImu, imu.source, imu.baud, functools.partial(from_thread, read), functools.partial(from_thread, end)
+        )
+        try:
+            robot.connected()
+            log.info("robot %s: %s is open", name, imu.source)
+            topics = [f"own/{name}"] if imu.pose_rate_hz > 0.0 else []
+            with self.hub.subscribed(
+                lambda data: port.write(data + b"\n"), lambda: 0, port.close, topics, imu.pose_rate_hz
+            ):
+                await lost
+        finally:
+            await asyncio.to_thread(port.close)
+
+    # Outputs
+
+    async def _publish(self) -> None:
+        await self.ready.wait()
+        period = 1.0 / self.config.server.pose_rate_hz
+        due = time.monotonic()
+        while True:
+            now = time.monotonic()
+            messages: dict[str, bytes] = {}
+            for name, robot in self.robots.items():
+                pose = robot.publish(now)
+                if pose is None:
+                    continue
+                if self._published is not None:
+                    self._published(pose)
+                if self.hub.wants(f"pose/{name}"):
+                    messages[f"pose/{name}"] = robot.encode(pose, now)
+                if self.hub.wants(f"own/{name}"):
+                    messages[f"own/{name}"] = robot.encode_own(pose, now)
+            self.hub.publish(now, messages)
+            for _ in self.hub.sweep(now):
+                log.warning("a client took nothing for %.0f s and was cut off", STALL_LIMIT)
+            # On schedule; after a pause from now, not in a burst.
+            due = max(due + period, now)
+            await asyncio.sleep(due - time.monotonic())
+
+    def health(self) -> dict[str, Any]:
+        now = time.monotonic()
+        robots = {name: robot.health(now) for name, robot in self.robots.items()}
+        cameras = {name: camera.health(now) for name, camera in self.cameras.items()}
+        reasons = [] if self.ready.is_set() else ["the filters are being compiled"]
+        for name, camera in cameras.items():
+            if camera["status"] != "ok":
+                reasons.append(f"camera {name}: {camera['status']}")
+            elif not camera["located"]:
+                reasons.append(f"camera {name}: {camera['location']}")
+        for name, robot in robots.items():
+            if robot["imu"] != "ok":
+                reasons.append(f"robot {name}: {robot['imu']}")
+            elif robot["mode"] != "FULL":
+                reasons.append(f"robot {name}: {_MODES[robot['mode']]}")
+        return {
+            "status": "degraded" if reasons else "ok",
+            "reasons": reasons,
+            "service": SERVICE,
+            "uptime": round(now - self._started, 1),
+            "clients": len(self.hub.subscriptions),
+            "messages_refused": self.refused,
+            "messages_dropped": self.hub.dropped,
+            "clients_cut_off": self.hub.cut_off,
+            "robots": robots,
+            "cameras": cameras,
+            "anchors": [
+                {"id": anchor.id, "position_m": anchor.position_m, "yaw_deg": anchor.yaw_deg, "size_mm": anchor.size_mm}
+                for anchor in self.config.anchor
+            ],
+        }
+
+    # HTTP
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answers what is no WebSocket; None lets a WebSocket in."""
+        path = urlsplit(request.path).path
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            return None if path in _WEBSOCKETS else _text(404, f"No WebSocket at {path}\n{_THERE_IS}", request)
+        if request.method not in ("GET", "HEAD"):
+            return _text(405, f"{request.method} is not possible here.\n{_THERE_IS}", request)
+        if path == "/healthz":
+            return _response(200, msgspec.json.encode(self.health()) + b"\n", "application/json", request)
+        if path in self._page:
+            return _response(200, *self._page[path], request)
+        if path in _WEBSOCKETS:
+            return _text(426, f"{path} is a WebSocket.\n{_THERE_IS}", request)
+        return _text(404, f"Nothing at {path}\n{_THERE_IS}", request)
+
+    # WebSockets
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        url = urlsplit(connection.request.path)
+        visitor = _Visitor.of(connection, url.path)
+        try:
+            if url.path == "/v1/robot":
+                await self._serve_robot(visitor)
+            elif url.path == "/v1/poses":
+                await self._serve_poses(visitor, url.query)
+            else:
+                await self._serve_tracker(visitor)
+        except RefusedError as error:
+            self.refused += 1
+            log.warning("%s was refused: %s", visitor.name, error)
+            with contextlib.suppress(ConnectionClosed):
+                await connection.send(encode(Error(str(error))), text=True)
+                # A close frame holds 123 bytes of reason.
+                await connection.close(CloseCode.POLICY_VIOLATION, str(error).encode()[:120].decode(errors="ignore"))
+        except ConnectionClosed as error:
+            if error.sent is not None and error.sent.code == CloseCode.MESSAGE_TOO_BIG:
+                self.refused += 1
+                log.warning("%s sent a message of more than %d bytes and was closed", visitor.name, MAX_MESSAGE)
+        finally:
+            if visitor.refused > 1:
+                log.warning("%s: %d messages were refused in all", visitor.name, visitor.refused)
+
+    async def _refuse(self, visitor: _Visitor, error: MessageError) -> None:
+        """Tell a client what was wrong with its message. It waits until the client takes that, so none can flood."""
+        self.refused += 1
+        visitor.refused += 1
+        if visitor.refused == 1:
+            log.warning("%s sent a message that cannot be used: %s", visitor.name, error)
+        await visitor.connection.send(encode(Error(str(error))), text=True)
+
+    async def _serve_tracker(self, visitor: _Visitor) -> None:
+        with self._client(visitor.connection, ["tracker"], room=TRACKER_ROOM):
+            async for _ in visitor.connection:
+                pass  # the original ignored what its clients sent
+
+    async def _serve_poses(self, visitor: _Visitor, query: str) -> None:
+        robots, rate_hz = self._poses_query(query)
+        with self._client(visitor.connection, [f"pose/{robot}" for robot in robots], rate_hz):
+            async for _ in visitor.connection:
+                await self._refuse(visitor, MessageError("/v1/poses only sends; robots speak on /v1/robot"))
+
+    def _poses_query(self, query: str) -> tuple[list[str], float]:
+        robots, rate_hz = list(self.robots), self.config.server.pose_rate_hz
+        for key, value in parse_qsl(query, keep_blank_values=True):
+            if key == "robots":
+                robots = [name for name in value.split(",") if name]
+                for name in robots:
+                    self._known(name)
+            elif key == "rate":
+                try:
+                    rate_hz = float(value)
+                except ValueError:
+                    rate_hz = math.nan
+                if not 0.0 < rate_hz <= 1000.0:
+                    raise RefusedError(f"rate={value}: poses a second are needed, above 0 and up to 1000")
+            else:
+                raise RefusedError(f"{key}={value} is not known here; robots=a,b and rate=50 are")
+        return robots, rate_hz
+
+    def _known(self, name: str) -> Robot:
+        if name not in self.robots:
+            known = ", ".join(self.robots) or "none"
+            raise RefusedError(f'there is no robot "{name}" in the configuration; known: {known}')
+        return self.robots[name]
+
+    def _client(
+        self, connection: ServerConnection, topics: Collection[str], rate_hz: float = 0.0, room: int = 0
+    ) -> AbstractContextManager[None]:
+        transport = connection.transport
+        if (sock := transport.get_extra_info("socket")) is not None and hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            # What a slow client has not taken then waits here, where the newer replaces it, and not in the kernel.
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 16 * 1024)
+        return self.hub.subscribed(
+            lambda data: broadcast([connection], data, text=True),
+            transport.get_write_buffer_size,
+            transport.abort,
+            topics,
+            rate_hz,
+            room,
+        )
+
+    async def _serve_robot(self, visitor: _Visitor) -> None:
+        connection = visitor.connection
+        hello = await self._hello(visitor)
+        robot = self._known(hello.robot)
+        if robot.config.imu.source != "websocket":
+            raise RefusedError(f'the IMU of "{hello.robot}" is on {robot.config.imu.source}, by the configuration')
+        link = self._take(robot, connection)
+        rate_hz = min(hello.pose_rate_hz, self.config.server.pose_rate_hz)
+        await connection.send(encode(Welcome(hello.robot, SERVICE, rate_hz)), text=True)
+        log.info("robot %s has connected", hello.robot)
+        topics = [f"own/{hello.robot}"] if rate_hz > 0.0 else []
+        clock = asyncio.create_task(self._ask_clock(link))
+        try:
+            with self._client(connection, topics, rate_hz):
+                async for data in connection:
+                    arrival = link.heard = time.monotonic()
+                    try:
+                        self._hear(robot, link, data, arrival)
+                    except MessageError as error:
+                        robot.dropped += 1
+                        await self._refuse(visitor, error)
+        finally:
+            clock.cancel()
+            if self._links.get(hello.robot) is link:
+                del self._links[hello.robot]
+                robot.trouble = "its connection has ended"
+                log.info("robot %s has gone", hello.robot)
+
+    async def _hello(self, visitor: _Visitor) -> Hello:
+        async for data in visitor.connection:
+            try:
+                message = decode(data)
+                if isinstance(message, Hello):
+                    return message
+                raise MessageError('the first message must be {"type":"hello","robot":"<name>"}')
+            except MessageError as error:
+                await self._refuse(visitor, error)
+        raise RefusedError("it left without a hello")
+
+    def _take(self, robot: Robot, connection: ServerConnection) -> _Link:
+        """Make this the robot's connection. One that has been silent, as after a lost link, gives way."""
+        name, now = robot.config.name, time.monotonic()
+        before = self._links.get(name)
+        if before is not None:
+            if now - before.heard < SILENCE:
+                raise RefusedError(f'robot "{name}" is already connected, from {before.connection.remote_address}')
+            log.info("robot %s has connected anew; its old connection was silent", name)
+            before.connection.transport.abort()
+        link = self._links[name] = _Link(connection, now)
+        robot.connected()
+        return link
+
+    def _hear(self, robot: Robot, link: _Link, data: str | bytes, arrival: float) -> None:
+        match decode(data):
+            case Imu() as message:
+                samples = raw_samples(message)
+                if self.ready.is_set():
+                    robot.feed_imu(samples, arrival)
+            case ClockAnswer(id, received, sent):
+                asked = link.questions.pop(id, None)
+                if asked is None:
+                    raise MessageError(f"a clock answer with id {id}, which was not asked")
+                if not max(abs(received), abs(sent)) < TIME_LIMIT:
+                    raise MessageError(f"a clock that reads {max(received, sent)}; seconds are needed")
+                robot.clock.exchange(asked, received, sent, arrival)
+            case Hello():
+                raise MessageError("a second hello")
+
+    async def _ask_clock(self, link: _Link) -> None:
+        for id in itertools.count():
+            # A question that waits behind unsent poses would measure those.
+            if link.connection.transport.get_write_buffer_size() == 0:
+                while len(link.questions) >= CLOCK_FAST_COUNT:
+                    del link.questions[next(iter(link.questions))]
+                now = link.questions[id] = time.monotonic()
+                broadcast([link.connection], encode(ClockQuestion(id, now)), text=True)
+            await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
+
+
+def _text(status: int, text: str, request: Request) -> Response:
+    return _response(status, text.encode(), "text/plain; charset=utf-8", request)
+
+
+def _response(status: int, body: bytes, kind: str, request: Request) -> Response:
+    headers = Headers(
+        {
+            "Date": formatdate(usegmt=True),
+            "Connection": "close",
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-cache",
+            "Content-Security-Policy": "default-src 'self'",
+            "X-Content-Type-Options": "nosniff",
+        }
+    )
+    status_line = http.HTTPStatus(status)
+    return Response(status_line.value, status_line.phrase, headers, b"" if request.method == "HEAD" else body)
+
+
+def _words(error: OSError, host: str, port: int) -> OSError:
+    if error.errno == errno.EADDRINUSE:
+        what = f"port {port} on {host} is in use: is another Steadfix running? `--port` takes another, 0 any free one"
+    elif error.errno == errno.EACCES:
+        what = f"port {port} on {host} is not allowed: ports below 1024 need rights; `--port` takes another"
+    else:
+        what = f"cannot listen on {host}, port {port}: {error.strerror or error}"
+    return OSError(error.errno or errno.EIO, what)

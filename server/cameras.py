@@ -1,0 +1,322 @@
+"""One camera of the running service: a thread that turns frames into sightings, a placement and fixes."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from camera.capture import Frame, FrameSource, open_source
+
+from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
+from camera.fix import MarkerMount, marker_poses, rays, solve
+from camera.floor import Anchor, Placement, PlacementError, locate_camera
+from camera.markers import MarkerDetector, MarkerSighting
+from fusion.geometry import log_so3, rotation_about_z, transform
+from fusion.measurements import Array, PoseFix
+from server.config import AnchorConfig, CameraConfig, Config, ConfigError, MarkerConfig
+from server.messages import tracker_message
+
+log = logging.getLogger("steadfix.camera")
+
+# s before a camera that is not there is tried again: the first pause, which doubles up to the longest.
+FIRST_PAUSE, LONGEST_PAUSE = 1.0, 30.0
+# Frames whose anchor corners are averaged for one placement, and s between two such looks at the anchors.
+PLACEMENT_FRAMES = 10
+PLACEMENT_CHECK = 5.0
+# A camera counts as moved beyond three sigma and these, m and rad, in two looks in a row.
+MOVED_POSITION, MOVED_ROTATION = 0.005, math.radians(0.2)
+# s over which the frame rate is counted.
+RATE_WINDOW = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What came of one frame. `tracker`: messages of the original tracker's stream, if anyone listens."""
+
+    fixes: tuple[PoseFix, ...]
+    tracker: tuple[bytes, ...]
+
+
+Open = Callable[[CameraConfig], FrameSource]
+
+
+def open_configured(config: CameraConfig) -> FrameSource:
+    return open_source(
+        config.source, width_px=config.width_px, height_px=config.height_px, frame_rate_hz=config.frame_rate_hz
+    )
+
+
+class Camera:
+    """Opens its source, and again whenever that is lost, until `stop`.
+
+    `deliver` is called from the camera's thread, once a frame; `tracker_wanted` tells there whether anyone listens to
+    the original stream, whose poses are not free. `status` says in words what keeps the camera from its work, and is
+    "" where nothing does. Raises ConfigError, CalibrationError or OSError for what cannot ever work.
+    """
+
+    def __init__(
+        self,
+        config: CameraConfig,
+        room: Config,
+        deliver: Callable[[Seen], None],
+        tracker_wanted: Callable[[], bool] = lambda: False,
+        open: Open = open_configured,
+    ) -> None:
+        self.config = config
+        self.status = "is being opened"
+        self.placement: Placement | None = None
+        self.unlocated = "no anchor has been seen yet"
+        self.frames = 0
+        self.markers: tuple[int, ...] = ()
+        self.last_frame = -math.inf
+        self.detect_ms = math.nan
+        self._deliver = deliver
+        self._tracker_wanted = tracker_wanted
+        self._open = open
+        if not Path(config.calibration).is_file():
+            raise CalibrationError(
+                f'camera "{config.name}": there is no calibration file {config.calibration}. It holds the camera '
+                "matrix and distortion of this very camera at this image size, as OpenCV's calibrateCamera gives "
+                "them; example-camera.toml, beside example.toml, shows the format and will do for a first try"
+            )
+        self.intrinsics = load_intrinsics(config.calibration)
+        self._anchors = [_anchor(anchor) for anchor in room.anchor]
+        self._anchor_ids = {anchor.id for anchor in room.anchor}
+        self._robots = [
+            (robot.name, [_mount(marker) for marker in robot.marker], robot.motion != "free") for robot in room.robot
+        ]
+        self._sizes = {marker.id: marker.size for marker in self._anchors}
+        self._sizes |= {mount.id: mount.size for _, mounts, _ in self._robots for mount in mounts}
+        try:
+            self._detector = MarkerDetector(config.dictionary, ids=self._sizes.keys())
+        except ValueError as error:
+            raise ConfigError(f'camera "{config.name}": {error}') from None
+        self._image_size = (0, 0)
+        # Anchors as seen in the frames of the present look; whether one whole look has been had; whether the last one
+        # found the camera elsewhere.
+        self._looks: list[list[MarkerSighting]] = []
+        self._next_look = -math.inf
+        self._settled = False
+        self._moved = False
+        self._arrivals: deque[float] = deque()
+        self._stop = threading.Event()
+        # A daemon: a driver that hangs must not keep the service from ending.
+        self._thread = threading.Thread(target=self._run, name=f"camera {config.name}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end; `join` waits for it."""
+        self._stop.set()
+
+    def join(self, timeout: float) -> None:
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE
+        while not self._stop.is_set():
+            frames = self.frames
+            try:
+                if self._watch():
+                    return
+            except (OSError, CalibrationError) as error:
+                trouble = str(error)
+            except Exception as error:
+                # A mistake of ours must not end the other cameras, nor be hidden.
+                trouble = f"stopped by an error inside Steadfix: {error!r}"
+                log.debug("camera %s", self.config.name, exc_info=True)
+            if self.frames > frames:
+                pause = FIRST_PAUSE
+            if trouble != self.status:
+                log.warning("camera %s: %s; trying again until it works", self.config.name, trouble)
+            self.status = trouble
+            self._stop.wait(pause)
+            pause = min(2.0 * pause, LONGEST_PAUSE)
+
+    def _watch(self) -> bool:
+        """Work until the source ends (True) or is lost (OSError)."""
+        source = self._open(self.config)
+        try:
+            while not self._stop.is_set():
+                frame = source.read(timeout=0.5)
+                if self._stop.is_set():
+                    break
+                if frame is None:
+                    self.status = "the source has ended"
+                    log.info("camera %s: %s", self.config.name, self.status)
+                    return True
+                if self.status:
+                    log.info("camera %s: frames are coming", self.config.name)
+                    self.status = ""
+                self._deliver(self._see(frame))
+        finally:
+            source.close()
+        return True
+
+    def _see(self, frame: Frame) -> Seen:
+        arrival = time.monotonic()
+        t = frame.t + self.config.time_offset
+        height_px, width_px = frame.image.shape[:2]
+        self.intrinsics.check_size(width_px, height_px)
+        self._image_size = (width_px, height_px)
+        sightings = self._detector.detect(frame.image, t, self.config.name)
+        self.detect_ms = (time.monotonic() - arrival) * 1e3
+        self.frames += 1
+        self.last_frame = arrival
+        self.markers = tuple(sorted(sighting.id for sighting in sightings))
+        self._arrivals.append(arrival)
+        while self._arrivals[0] < arrival - RATE_WINDOW:
+            self._arrivals.popleft()
+        if arrival >= self._next_look:
+            self._look([sighting for sighting in sightings if sighting.id in self._anchor_ids], arrival)
+        return Seen(
+            fixes=tuple(self._fixes(sightings, arrival)),
+            tracker=tuple(self._tracker(sightings)) if self._tracker_wanted() else (),
+        )
+
+    def _look(self, anchors: list[MarkerSighting], now: float) -> None:
+        """Find the camera from its anchors: at once, better with each of the first frames; then keep it and check."""
+        if not anchors:
+            if self.placement is None:
+                self.unlocated = f"no anchor is in view; looking for {_listed(self._anchor_ids)}"
+            return
+        self._looks.append(anchors)
+        whole = len(self._looks) >= PLACEMENT_FRAMES
+        if self._settled and not whole:
+            return
+        looks = list(self._looks)
+        if whole:
+            self._looks.clear()
+            self._next_look = now + PLACEMENT_CHECK
+        try:
+            found = locate_camera(_averaged(looks), self._anchors, self.intrinsics)
+        except PlacementError as error:
+            if str(error) != self.unlocated:
+                log.warning("camera %s: %s", self.config.name, error)
+            self.unlocated = str(error)
+            return
+        self.unlocated = ""
+        if not self._settled:
+            if self.placement is None:
+                height = float(found.world_from_camera[2, 3])
+                log.info("camera %s is located, %.2f m above the floor", self.config.name, height)
+            self.placement, self._settled = found, whole
+        elif self.placement is not None and (shift := _moved(self.placement, found)) is not None:
+            # One look can be wrong, say with a foot on an anchor; two in a row are not.
+            if self._moved:
+                log.warning("camera %s has moved by %.0f mm, or an anchor has", self.config.name, 1e3 * shift)
+                self.placement = found
+            self._moved = not self._moved
+        else:
+            self._moved = False
+
+    def _fixes(self, sightings: list[MarkerSighting], arrival: float) -> Iterator[PoseFix]:
+        placement = self.placement
+        if placement is None:
+            return
+        for robot, mounts, planar in self._robots:
+            fix = solve(
+                robot,
+                mounts,
+                sightings,
+                self.intrinsics,
+                placement.world_from_camera,
+                planar=planar,
+                arrival=arrival,
+                placement_covariance=placement.covariance,
+            )
+            if fix is not None:
+                yield fix
+
+    def _tracker(self, sightings: list[MarkerSighting]) -> Iterator[bytes]:
+        for sighting in sightings:
+            size = self._sizes[sighting.id]
+            for pose in marker_poses(sighting.corners_px, size, self.intrinsics, sighting.sigma_px)[:1]:
+                yield tracker_message(sighting.id, sighting.corners_px, pose.camera_from_marker)
+
+    def frame_rate_hz(self, now: float) -> float:
+        recent = [t for t in list(self._arrivals) if t >= now - RATE_WINDOW]
+        return 0.0 if len(recent) < 2 else (len(recent) - 1) / (recent[-1] - recent[0])
+
+    def health(self, now: float) -> dict[str, Any]:
+        placement = self.placement
+        return {
+            "status": self.status or "ok",
+            "frame_rate_hz": round(self.frame_rate_hz(now), 1),
+            "frame_age": round(now - self.last_frame, 3) if math.isfinite(self.last_frame) else None,
+            "frames": self.frames,
+            "detect_ms": round(self.detect_ms, 1) if math.isfinite(self.detect_ms) else None,
+            "markers": list(self.markers),
+            "located": placement is not None,
+            "location": self.unlocated or "ok",
+            "position_m": None if placement is None else placement.world_from_camera[:3, 3].round(4).tolist(),
+            "view_m": None if placement is None else _view_on_floor(placement, self.intrinsics, *self._image_size),
+        }
+
+
+def _anchor(config: AnchorConfig) -> Anchor:
+    return Anchor(config.id, config.size_mm / 1000.0, _pose(config.position_m, config.yaw_deg))
+
+
+def _mount(config: MarkerConfig) -> MarkerMount:
+    return MarkerMount(config.id, config.size_mm / 1000.0, _pose(config.position_m, config.yaw_deg))
+
+
+def _pose(position_m: tuple[float, float, float], yaw_deg: float) -> Array:
+    return transform(rotation_about_z(math.radians(yaw_deg)), position_m)
+
+
+def _averaged(looks: Sequence[Sequence[MarkerSighting]]) -> list[MarkerSighting]:
+    """One sighting for each marker, its corners the mean over the looks: the camera stands still, its noise does not.
+
+    The sigma stays that of one look, since what is left is mostly bias.
+    """
+    by_id: dict[int, list[MarkerSighting]] = {}
+    for look in looks:
+        for sighting in look:
+            by_id.setdefault(sighting.id, []).append(sighting)
+    return [
+        replace(same[-1], corners_px=np.mean([sighting.corners_px for sighting in same], axis=0))
+        for same in by_id.values()
+    ]
+
+
+def _moved(kept: Placement, found: Placement) -> float | None:
+    """By how many metres a camera has moved on the floor below it, or None if it stands where it was."""
+    shift = found.world_from_camera[:3, 3] - kept.world_from_camera[:3, 3]
+    turn = log_so3(found.world_from_camera[:3, :3] @ kept.world_from_camera[:3, :3].T)
+    sigma = np.sqrt(np.diag(kept.covariance) + np.diag(found.covariance))
+    if (np.abs(shift) > np.maximum(3.0 * sigma[:3], MOVED_POSITION)).any() or (
+        np.abs(turn) > np.maximum(3.0 * sigma[3:], MOVED_ROTATION)
+    ).any():
+        return float(np.linalg.norm(shift))
+    return None
+
+
+def _view_on_floor(placement: Placement, intrinsics: Intrinsics, width_px: int, height_px: int) -> list[list[float]]:
+    """The outline of what the camera sees of the floor, m: the border of the image cut with z = 0."""
+    u, v = np.linspace(0.0, width_px - 1.0, 9), np.linspace(0.0, height_px - 1.0, 9)
+    border = (
+        [(x, 0.0) for x in u] + [(u[-1], y) for y in v] + [(x, v[-1]) for x in u[::-1]] + [(0.0, y) for y in v[::-1]]
+    )
+    directions = rays(np.array(border), intrinsics) @ placement.world_from_camera[:3, :3].T
+    camera = placement.world_from_camera[:3, 3]
+    # Above the horizon there is no floor; 20 m is as far as one wants to see it.
+    down = np.minimum(directions[:, 2], -np.linalg.norm(directions[:, :2], axis=1) * camera[2] / 20.0)
+    points: Array = camera[:2] - (camera[2] / down)[:, None] * directions[:, :2]
+    outline: list[list[float]] = points.round(3).tolist()
+    return outline
+
+
+def _listed(ids: Collection[int]) -> str:
+    return ("marker " if len(ids) == 1 else "markers ") + ", ".join(map(str, sorted(ids)))

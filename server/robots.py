@@ -1,0 +1,116 @@
+"""One robot of the running service: its filter, its clock, its connection and its figures."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+from fusion.localiser import Localiser
+
+from fusion.measurements import ImuBatch, Pose, PoseFix
+from imu.clock import DeviceClock
+from imu.protocols import RawSample
+from server.config import RobotConfig
+from server.messages import encode, pose_message
+
+# Seconds over which the rate of the IMU is counted.
+RATE_WINDOW = 2.0
+
+
+class Recording(Protocol):
+    """What a robot writes to while it runs: every input in the order in which the filter gets it, and the poses."""
+
+    def imu(self, batch: ImuBatch) -> None: ...
+    def fix(self, fix: PoseFix) -> None: ...
+    def pose(self, pose: Pose) -> None: ...
+
+
+class Robot:
+    """All times are host monotonic seconds. Everything is called from the service's one loop."""
+
+    def __init__(self, config: RobotConfig, recording: Recording | None = None) -> None:
+        self.config = config
+        self.localiser = Localiser(config.name, config.filter, config.motion, config.engine)
+        self.clock = DeviceClock()
+        # Why no IMU data come, in words, or "" while they do.
+        self.trouble = "no IMU has connected yet"
+        self.dropped = 0
+        # Host time of the last IMU data.
+        self.heard = -math.inf
+        self.published = 0
+        self._recording = recording
+        self._arrivals: deque[tuple[float, int]] = deque()
+
+    def connected(self) -> None:
+        """Its IMU is there, perhaps with a clock that has begun anew."""
+        self.clock = DeviceClock()
+        self.trouble = "it has connected, but sent no IMU data yet"
+
+    def feed_imu(self, raw: Sequence[RawSample], arrival: float) -> None:
+        """Readings that reached the service together."""
+        if not raw:
+            return
+        self.trouble = ""
+        self.heard = arrival
+        self._arrivals.append((arrival, len(raw)))
+        while self._arrivals[0][0] < arrival - RATE_WINDOW:
+            self._arrivals.popleft()
+        batch = ImuBatch(self.config.name, arrival, self.clock.stamp(raw, arrival))
+        if self._recording is not None:
+            self._recording.imu(batch)
+        self.localiser.feed(batch)
+
+    def feed_fix(self, fix: PoseFix, arrival: float) -> None:
+        """`arrival` counts from now: the order in which inputs reach the filter is the order of their arrivals."""
+        fix = replace(fix, arrival=arrival)
+        if self._recording is not None:
+            self._recording.fix(fix)
+        self.localiser.feed(fix)
+
+    def publish(self, now: float) -> Pose | None:
+        """The pose for this instant; None before the first fix."""
+        pose = self.localiser.pose_at(now)
+        if pose is not None:
+            self.published += 1
+            if self._recording is not None:
+                self._recording.pose(pose)
+        return pose
+
+    def encode(self, pose: Pose, now: float) -> bytes:
+        """For everyone."""
+        return encode(pose_message(pose, now, self.published))
+
+    def encode_own(self, pose: Pose, now: float) -> bytes:
+        """For the robot itself: with the time in its own clock, where that is known."""
+        t_robot = self.clock.to_device(pose.t)
+        return encode(pose_message(pose, now, self.published, t_robot if math.isfinite(t_robot) else None))
+
+    def imu_rate_hz(self, now: float) -> float:
+        recent = [(t, n) for t, n in self._arrivals if t >= now - RATE_WINDOW]
+        if len(recent) < 2:
+            return 0.0
+        # The first arrival only opens the window: its samples were taken before it.
+        return sum(n for _, n in recent[1:]) / max(recent[-1][0] - recent[0][0], 1e-3)
+
+    def health(self, now: float) -> dict[str, Any]:
+        pose = self.localiser.pose_at(now)
+        delay = self.clock.minimum_delay
+        trouble = self.trouble
+        if not trouble and now - self.heard > 1.0:
+            trouble = f"no IMU data for {now - self.heard:.0f} s"
+        return {
+            "mode": "INIT" if pose is None else pose.mode.value,
+            "fix_age": None if pose is None or not math.isfinite(pose.fix_age) else round(pose.fix_age, 3),
+            "imu_rate_hz": round(self.imu_rate_hz(now), 1),
+            "imu": trouble or "ok",
+            "imu_refused": self.dropped,
+            "clock_skew_ppm": round(self.clock.skew * 1e6, 1),
+            "clock_restarts": self.clock.restarts,
+            "link_delay_ms": None if delay is None else round(delay * 1e3, 2),
+            "poses_published": self.published,
+            "reset_id": 0 if pose is None else pose.reset_id,
+            "counts": dict(self.localiser.counts),
+        }

@@ -1,0 +1,82 @@
+"""`steadfix run`: the service from the command line, with a configuration or in front of the demo room."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import logging
+import signal
+import sys
+
+import cv2
+import msgspec
+
+from server.app import SERVICE, Service
+from server.config import Config, load
+from server.demo.room import DemoRoom
+from server.recording import Recorder
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", nargs="?", metavar="CONFIG.toml", help="without it: a simulated room to look at")
+    parser.add_argument("--host", help="address to listen on, instead of the configured one")
+    parser.add_argument("--port", type=int, help="port to listen on, instead of the configured one; 0 for any free one")
+    parser.add_argument("--record", metavar="FOLDER", help="keep all inputs there, for `steadfix replay`")
+
+
+def run(args: argparse.Namespace) -> int:
+    logging.basicConfig(format="%(asctime)s  %(message)s", datefmt="%H:%M:%S", level=logging.INFO, stream=sys.stderr)
+    # Its INFO is one line for each connection.
+    logging.getLogger("websockets").setLevel(logging.ERROR)
+    # One thread for each camera is what keeps several of them fast.
+    cv2.setNumThreads(1)
+    return asyncio.run(_run(args))
+
+
+async def _run(args: argparse.Namespace) -> int:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    room = DemoRoom() if args.config is None else None
+    try:
+        if room is None:
+            await _serve_until(stop, load(args.config), args)
+        else:
+            await _serve_until(stop, room.config(), args, room)
+    finally:
+        if room is not None:
+            room.stop()
+            print(room.report(), flush=True)
+    return 0
+
+
+async def _serve_until(
+    stop: asyncio.Event, config: Config, args: argparse.Namespace, room: DemoRoom | None = None
+) -> None:
+    changes = {key: value for key in ("host", "port") if (value := getattr(args, key)) is not None}
+    config = msgspec.structs.replace(config, server=msgspec.structs.replace(config.server, **changes))
+    async with contextlib.AsyncExitStack() as stack:
+        recording = None
+        if args.record is not None:
+            recording = stack.enter_context(contextlib.closing(Recorder(args.record, [r.name for r in config.robot])))
+        if room is None:
+            service = Service(config, recording)
+        else:
+            service = Service(config, recording, room.open_camera, room.score)
+        await stack.enter_async_context(service)
+        if room is not None:
+            room.start(f"ws://{_reachable(config.server.host)}:{service.port}")
+        print(f"{SERVICE}: http://{_reachable(config.server.host)}:{service.port}/", flush=True)
+        stopped = asyncio.create_task(stop.wait())
+        await asyncio.wait((stopped, service.failed), return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        if service.failed.done():
+            service.failed.result()
+
+
+def _reachable(host: str) -> str:
+    """The host to put into an address on this machine."""
+    if host in ("", "0.0.0.0", "::"):
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
