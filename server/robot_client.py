@@ -64,12 +64,11 @@ class Robot:
         self._pose_received = -math.inf
         self._pose_arrived = asyncio.Event()
         self._connection: ClientConnection | None = None
-        self._welcomed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Robot:
-        self._task = asyncio.create_task(self._run(), name=f"robot {self.name}")
-        welcomed = asyncio.create_task(self._welcomed.wait())
+        welcomed = asyncio.get_running_loop().create_future()
+        self._task = asyncio.create_task(self._run(welcomed), name=f"robot {self.name}")
         try:
             await asyncio.wait((self._task, welcomed), return_when=asyncio.FIRST_COMPLETED)
             if self._task.done():
@@ -77,8 +76,6 @@ class Robot:
         except BaseException:
             await self.__aexit__(None, None, None)
             raise
-        finally:
-            welcomed.cancel()
         return self
 
     async def __aexit__(
@@ -131,7 +128,7 @@ class Robot:
                 last = self.pose
                 yield last
 
-    async def _run(self) -> None:
+    async def _run(self, welcomed: asyncio.Future[None]) -> None:
         """Connect, and again whenever the connection is lost."""
         pause = FIRST_PAUSE
         while True:
@@ -142,7 +139,7 @@ class Robot:
                 ) as connection:
                     await connection.send(encode(Hello(self.name, self._pose_rate_hz)), text=True)
                     async for message in connection:
-                        welcome |= await self._receive(connection, message)
+                        welcome |= await self._receive(connection, message, welcomed)
             except (OSError, TimeoutError, WebSocketException) as error:
                 log.info("%s: no connection to %s: %s", self.name, self._url, error)
             finally:
@@ -150,7 +147,7 @@ class Robot:
             pause = FIRST_PAUSE if welcome else min(2.0 * pause, LONGEST_PAUSE)
             await asyncio.sleep(pause)
 
-    async def _receive(self, connection: ClientConnection, data: str | bytes) -> bool:
+    async def _receive(self, connection: ClientConnection, data: str | bytes, welcomed: asyncio.Future[None]) -> bool:
         """Take one message in; whether it was the welcome."""
         received = self.clock()
         try:
@@ -168,11 +165,12 @@ class Robot:
                 await connection.send(encode(ClockAnswer(id, received, self.clock())), text=True)
             case Welcome():
                 self._connection = connection
-                self._welcomed.set()
+                if not welcomed.done():
+                    welcomed.set_result(None)
                 return True
             case Error(reason=reason):
                 # Before the first welcome it is a refusal, for which trying again is no remedy.
-                if not self._welcomed.is_set():
+                if not welcomed.done():
                     raise RefusedError(reason)
                 log.warning("%s: the service says: %s", self.name, reason)
         return False

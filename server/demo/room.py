@@ -58,19 +58,20 @@ class DemoRoom:
     """The room, for a service that runs in this process:
 
         room = DemoRoom()                                   # makes the pty of the serial line
-        service = Service(room.config(), open_camera=room.open_camera)
+        service = Service(room.config(), recording, room.open_camera, room.score)
+        room.record_truth = recorder.truth                  # if there is a recording
         room.start(f"ws://127.0.0.1:{service.port}")        # as soon as the service listens: the robots
-        ... room.score(pose) for each published pose ...    # from one thread, here the service's loop
         room.stop()
         print(room.report())
 
-    `truth` is called for each line of truth as `truth(robot, t, position, quaternion_wxyz)`, in a thread of the room:
-    for recordings. The robots end with this process however it ends, since nobody reads their truth any more.
+    `score` and `report` are for one thread, the service's. `record_truth(robot, t, position, quaternion_wxyz)` is
+    called for each line of truth, 100 a second and robot, in a thread of the room.
+    The robots end with this process however it ends, since nobody reads their truth any more.
     """
 
-    def __init__(self, truth: Callable[[str, float, Array, Array], None] | None = None, seed: int = 1) -> None:
+    def __init__(self, seed: int = 1) -> None:
+        self.record_truth: Callable[[str, float, Array, Array], None] | None = None
         self._seed = seed
-        self._record = truth
         self._robots: dict[str, subprocess.Popen[bytes]] = {}
         self._truth: dict[str, list[Truth]] = {name: [] for name in COURSES}
         self._news = threading.Condition()
@@ -152,10 +153,10 @@ class DemoRoom:
             if kept and kept[-1][0] - kept[0][0] > 2.0 * HISTORY:
                 del kept[: len(kept) // 2]
             self._news.notify_all()
-        if self._record is not None:
+        if self.record_truth is not None:
             for t, x, y, yaw in lines:
                 half = 0.5 * yaw
-                self._record(robot, t, np.array([x, y, 0.0]), np.array([math.cos(half), 0.0, 0.0, math.sin(half)]))
+                self.record_truth(robot, t, np.array([x, y, 0.0]), np.array([math.cos(half), 0.0, 0.0, math.sin(half)]))
 
     def at(self, robot: str, t: float) -> tuple[float, float, float] | None:
         """(x, y, yaw) of a robot at `t`, m and rad; None for a time that is not known, or not yet."""
