@@ -59,19 +59,21 @@ class Localiser:
         self.robot = robot
         self.params = params or FilterParams()
         self.motion = motion
+        self.engine = engine
         self._timeline = _timeline(engine, self.params, motion)
         self._outcomes = dict.fromkeys(Outcome, 0)
         self._samples = 0
         self._sources: dict[tuple[float, float], str] = {}
 
-    def feed(self, measurement: ImuBatch | PoseFix) -> list[FixOutcome]:
+    def feed(self, measurement: ImuBatch | PoseFix, track: Array | None = None) -> list[FixOutcome]:
         """Take a measurement. -> the fixes that were judged by this call.
 
         That is usually the fix just fed, or none; a fix stamped later than all IMU data so far is judged when they
         have come. Late, repeated and unbelievable measurements are outcomes and counts, never exceptions.
+        `track`: see `feed_samples`, for a batch of IMU samples.
         """
         if isinstance(measurement, ImuBatch):
-            self.feed_samples(measurement.samples)
+            self.feed_samples(measurement.samples, track)
         else:
             status = self._timeline.feed_fix(fix_row(measurement))
             if status != k.PENDING:

@@ -63,7 +63,7 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     """score by which one pose of a flat marker must beat the other to be believed with its tilt."""
 
     reinit_gate: Positive = 16.81
-    """chi-square .99 at 6 degrees of freedom: rejected fixes whose d2 to each other, through the IMU, is below agree."""
+    """chi-square .99 at 6 degrees of freedom: rejected fixes agree when their d2 through the IMU is below."""
     reinit_count: Annotated[int, Meta(ge=2)] = 3
     """that many rejects in a row that agree set the pose anew, if their attitude also agrees with the gyro."""
     reinit_patience: Positive = 15.0

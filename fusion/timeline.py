@@ -44,11 +44,9 @@ class Timeline:
     """Measurements in, in any order; the state after all of them out."""
 
     def __init__(self, params: FilterParams, motion: Motion) -> None:
-        self._memory = np.zeros(k.MEMORY)
-        self._meta, vector, self.state, _, self._fixes, _ = k.views(self._memory)
-        vector[:] = parameter_vector(params, motion)
-        k.clear(self._memory)
-        self._no_track = np.zeros((0, 8))
+        self._memory = k.new_memory(parameter_vector(params, motion))
+        self._meta, _, self.state, _, self._fixes, _ = k.views(self._memory)
+        self._nothing = np.zeros((0, 8))
         self._waiting = 0  # fixes in the ring whose outcome has not been told
 
     def feed_samples(self, samples: Array, track: Array | None = None) -> int:
@@ -57,32 +55,35 @@ class Timeline:
         `track` (n, 8) receives the pose after each sample, at its stamp: t, position, quaternion wxyz; NaN before
         the first fix.
         """
-        return int(k.feed_samples(self._memory, samples, self._no_track if track is None else track))
+        outputs = self._nothing if track is None else track
+        return int(k.process(self._memory, k.FEED_SAMPLES, 0.0, samples, outputs))
 
     def feed_fix(self, row: Array) -> int:
         """A fix as `fix_row` makes it. -> `kernels.PENDING`, `TOO_LATE` or `DUPLICATE`."""
-        status = int(k.feed_fix(self._memory, row))
+        status = int(k.process(self._memory, k.FEED_FIX, 0.0, row[np.newaxis], self._nothing))
         if status == k.PENDING:
             self._waiting += 1
         return status
 
     def judged(self) -> list[Array]:
         """The rows of the fixes that have been judged since this was last asked, oldest stamp first."""
-        if not self._waiting:
-            return []
-        rows = []
-        for number in range(int(self._meta[k.FIX_FIRST]), int(self._meta[k.FIX_END])):
-            row = self._fixes[number % k.FIX_CAPACITY]
-            if row[k.F_OUTCOME] != k.PENDING and not row[k.F_REPORTED]:
-                row[k.F_REPORTED] = 1.0
-                rows.append(row.copy())
+        rows: list[Array] = []
+        number, waiting = int(self._meta[k.FIX_END]), self._waiting
+        while waiting and number > self._meta[k.FIX_FIRST]:
+            number -= 1
+            row = self._fixes[number & k.FIX_MASK]
+            if not row[k.F_REPORTED]:
+                waiting -= 1
+                if row[k.F_OUTCOME] != k.PENDING:
+                    row[k.F_REPORTED] = 1.0
+                    rows.insert(0, row.copy())
         self._waiting -= len(rows)
         return rows
 
     def pose_at(self, t: float) -> Array | None:
         """A pose (kernels.POSE,) for instant t; None before the first fix, or before the buffer."""
-        out = np.empty(k.POSE)
-        return out if k.pose_at(self._memory, t, out) else None
+        out = np.empty((1, k.POSE))
+        return out[0] if k.process(self._memory, k.POSE_AT, t, self._nothing, out) else None
 
     @property
     def figures(self) -> dict[str, int]:

@@ -1,0 +1,159 @@
+"""`steadfix replay`: a recording through the filter in order of arrival, as it would have gone live."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from tqdm import tqdm
+
+from fusion.consistency import hold_last, track_error
+from fusion.localiser import Localiser, warm_up
+from fusion.measurements import Array, FixOutcome, Outcome
+from fusion.params import Engine, FilterParams, Motion
+from server import config
+from server.recording import Recording, RecordingError, load, robot_folders, write_tum
+
+ACCEPTED = (Outcome.INITIALISED, Outcome.ACCEPTED, Outcome.INFLATED, Outcome.REINITIALISED)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("recording", type=Path, help="folder with imu.csv and fixes.csv, or one of such folders")
+    parser.add_argument("--out", type=Path, metavar="POSES", help="write a pose per IMU sample, in TUM format")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="motion model and noise of the robot from here")
+    parser.add_argument("--robot", metavar="NAME", help="which robot of the configuration it is")
+    parser.add_argument("--engine", choices=get_args(Engine), help="default: the robot's, else numba")
+    parser.add_argument("--motion", choices=get_args(Motion), help="default: the robot's, else ground")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+
+
+def replay(recording: Recording, localiser: Localiser, progress: Any = None) -> tuple[Array, list[FixOutcome], float]:
+    """Feed a recording to a localiser in order of arrival, a fix before a sample that arrives with it.
+
+    -> the causal track (n, 8), a row per IMU sample in order of arrival: its stamp, position, quaternion wxyz, NaN
+    before the first fix; the fixes' outcomes; the seconds that it took. `progress` is called with the number of
+    samples done.
+    """
+    track = np.full((len(recording.samples), 8), np.nan)
+    outcomes: list[FixOutcome] = []
+    stops = np.searchsorted(recording.arrival, [fix.arrival for fix in recording.fixes], side="left")
+    at = 0
+    began = time.perf_counter()
+    for fix, stop in zip(recording.fixes, stops, strict=True):
+        if stop > at:
+            localiser.feed_samples(recording.samples[at:stop], track[at:stop])
+            outcomes += localiser.judged()
+            at = int(stop)
+            if progress is not None:
+                progress(at)
+        outcomes += localiser.feed(fix)
+    localiser.feed_samples(recording.samples[at:], track[at:])
+    outcomes += localiser.judged()
+    return track, outcomes, time.perf_counter() - began
+
+
+def summary(recording: Recording, localiser: Localiser, track: Array, outcomes: list[FixOutcome], took: float) -> Any:
+    """What there is to say of a replay, as plain values; None where nothing can be said."""
+    span = float(np.ptp(recording.samples[:, 0]))
+    counts = localiser.counts
+    d2 = [outcome.d2 for outcome in outcomes if outcome.outcome in (Outcome.ACCEPTED, Outcome.INFLATED)]
+    answer: dict[str, Any] = {
+        "recording": recording.name,
+        "motion": localiser.motion,
+        "engine": localiser.engine,
+        "duration_s": span,
+        "samples": counts["imu_samples"],
+        "samples_dropped": counts["imu_duplicates"] + counts["imu_late"],
+        "fixes": len(recording.fixes),
+        "fixes_accepted": sum(counts[outcome.name.lower()] for outcome in ACCEPTED),
+        "fixes_rejected": counts["rejected"],
+        "fixes_late": counts["too_late"],
+        "outcomes": {outcome.name.lower(): counts[outcome.name.lower()] for outcome in Outcome if outcome},
+        "resets": counts["reinitialised"],
+        "nis_mean": float(np.mean(d2)) if d2 else None,
+        "gyro_bias": localiser.gyro_bias.tolist(),
+        "accel_bias": localiser.accel_bias.tolist(),
+        "speed": span / took if took > 0.0 else None,
+    }
+    if recording.truth is not None:
+        error = track_error(track, recording.truth)
+        poses = [(fix.t, *fix.hypotheses[0].position, *fix.hypotheses[0].quaternion_wxyz) for fix in recording.fixes]
+        held = hold_last(np.array(poses), np.array([fix.arrival for fix in recording.fixes]), track[:, 0])
+        holding = track_error(held, recording.truth)
+        answer |= {
+            "truth_matched": len(error.t),
+            "rmse_mm": 1e3 * error.position_rmse,
+            "rmse_deg": math.degrees(error.attitude_rmse),
+            "hold_last_mm": 1e3 * holding.position_rmse,
+            "hold_last_deg": math.degrees(holding.attitude_rmse),
+        }
+        answer = {key: None if isinstance(v, float) and math.isnan(v) else v for key, v in answer.items()}
+    return answer
+
+
+def _table(s: Any) -> str:
+    rows = [
+        ("recording", f"{s['recording']}, {s['duration_s']:.1f} s, motion {s['motion']}, engine {s['engine']}"),
+        ("IMU samples", f"{s['samples']}" + (f", {s['samples_dropped']} dropped" if s["samples_dropped"] else "")),
+        (
+            "fixes",
+            f"{s['fixes']}: {s['fixes_accepted']} accepted, {s['fixes_rejected']} rejected, {s['fixes_late']} too late",
+        ),
+    ]
+    if s["resets"]:
+        rows.append(("resets", str(s["resets"])))
+    if s.get("rmse_mm") is not None:
+        rows.append(("RMSE", f"{s['rmse_mm']:.1f} mm, {s['rmse_deg']:.2f} deg over {s['truth_matched']} instants"))
+        rows.append(("holding the last fix", f"{s['hold_last_mm']:.1f} mm, {s['hold_last_deg']:.2f} deg"))
+    elif "rmse_mm" in s:
+        rows.append(("RMSE", "no pose at an instant that the truth covers"))
+    if s["speed"]:
+        rows.append(("speed", f"{s['speed']:.0f} x real time"))
+    return "\n".join(f"{name:<22}{text}" for name, text in rows)
+
+
+def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion, Engine]:
+    params = FilterParams()
+    motion: Motion = "ground"
+    engine: Engine = "numba"
+    if args.config is not None:
+        robots = {robot.name: robot for robot in config.load(args.config).robot}
+        wanted = args.robot or (name if name in robots else next(iter(robots), "") if len(robots) == 1 else "")
+        if wanted not in robots:
+            raise RecordingError(
+                f"{args.config}: no robot {wanted or name!r}; it has {', '.join(sorted(robots)) or 'none'}: "
+                "say with --robot which one the recording is of"
+            )
+        robot = robots[wanted]
+        params, motion, engine = robot.filter, robot.motion, robot.engine
+    return params, args.motion or motion, args.engine or engine
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay, print, write. -> exit status."""
+    folders = robot_folders(args.recording)
+    if args.out is not None and len(folders) > 1:
+        args.out.mkdir(parents=True, exist_ok=True)
+    for folder in folders:
+        params, motion, engine = _settings(args, folder.resolve().name)
+        recording = load(folder, params)
+        if engine == "numba":
+            warm_up()
+        localiser = Localiser(recording.name, params, motion, engine)
+        with tqdm(
+            total=len(recording.samples), unit=" samples", delay=1.0, leave=False, disable=not sys.stderr.isatty()
+        ) as bar:
+            result = replay(recording, localiser, lambda done, bar=bar: bar.update(done - bar.n))
+        track, _, _ = result
+        figures = summary(recording, localiser, *result)
+        print(json.dumps(figures) if args.json else _table(figures))
+        if args.out is not None:
+            write_tum(args.out / f"{recording.name}.tum" if len(folders) > 1 else args.out, track)
+    return 0
