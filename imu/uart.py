@@ -18,8 +18,7 @@ class SerialImu:
 
     `received(data, arrival)` is called in the reader thread for all bytes that came together, with the host monotonic
     time at which they were read. `lost(error)` is called there once, with an OSError that names the port, if the
-    device goes away; not after `close`. Raises OSError in plain words if the port cannot be opened, ValueError for a
-    baud rate that the port does not know.
+    device goes away; not after `close`. Raises OSError in plain words if the port cannot be opened, or not at this speed.
     """
 
     def __init__(
@@ -34,6 +33,8 @@ class SerialImu:
         self._lost = lost
         try:
             self._serial = serial.Serial(port, baud, timeout=1.0, write_timeout=WRITE_TIMEOUT, exclusive=True)
+        except ValueError:
+            raise OSError(f"serial port {port}: it does not do {baud} baud") from None
         except serial.SerialException as error:
             raise OSError(f"serial port {port}: {_plain(error)}") from None
         # Drivers that cannot do it (a pty, most USB modems) say so in different ways.

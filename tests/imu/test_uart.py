@@ -141,6 +141,11 @@ def test_a_port_in_use(device: Device) -> None:
     host.serial.close()
 
 
+def test_a_speed_that_does_not_exist(device: Device) -> None:
+    with pytest.raises(OSError, match="it does not do -1 baud"):
+        SerialImu(device.port, -1, lambda *_: None, lambda _: None)
+
+
 def test_something_that_is_no_port(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.touch()
