@@ -17,8 +17,8 @@ class SerialImu:
     """A port, open until `close` or until the device goes away.
 
     `received(data, arrival)` is called in the reader thread for all bytes that came together, with the host monotonic
-    time at which they were read. `lost(error)` is called there once, with an OSError that names the port, if the
-    device goes away; not after `close`. Raises OSError in plain words if the port cannot be opened, or not at this speed.
+    time at which they were read. `lost(error)` is called there once, with an OSError that names the port, if the device
+    goes away; not after `close`. Raises OSError in plain words if the port cannot be opened, or not at this speed.
     """
 
     def __init__(
