@@ -33,8 +33,7 @@ import numpy as np
 from numba import njit
 
 from fusion.measurements import Array
-
-GRAVITY = 9.80665
+from fusion.params import GRAVITY
 
 # --- One filter: nominal state, then the covariance of its error, row by row -------------------------------------
 Q, V, POS, BG, BA, TD, TILT = 0, 4, 7, 10, 13, 16, 17

@@ -45,9 +45,14 @@ class Timeline:
 
     def __init__(self, params: FilterParams, motion: Motion) -> None:
         self._memory = k.new_memory(parameter_vector(params, motion))
-        self._meta, _, self.state, _, self._fixes, _ = k.views(self._memory)
+        self._meta, _, self._state, _, self._fixes, _ = k.views(self._memory)
         self._nothing = np.zeros((0, 8))
         self._waiting = 0  # fixes in the ring whose outcome has not been told
+
+    @property
+    def state(self) -> Array:
+        """(kernels.STATE,): the live filter, a view."""
+        return self._state
 
     def feed_samples(self, samples: Array, track: Array | None = None) -> int:
         """IMU samples (n, 7): t, gyro, accel. -> how many were neither duplicates nor older than the buffer.

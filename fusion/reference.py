@@ -1,0 +1,549 @@
+"""The same model on `filterpy.kalman.ExtendedKalmanFilter`: the engine without a compiler, and the kernels' oracle.
+
+Written from the equations with whole matrices, not from the kernels: where both agree, neither has a slip. The model
+and the rules of the timeline are described in `fusion.kernels`; the layouts of fixes and poses are shared with it.
+"""
+
+from __future__ import annotations
+
+import bisect
+import copy
+import math
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from fusion import kernels as k
+from fusion.geometry import exp_so3, log_so3, quaternion_from_rotation, rotation_from_quaternion, skew
+from fusion.measurements import Array
+from fusion.params import GRAVITY, FilterParams, Motion
+
+TH, DV, DP, DBG, DBA, DTD, DTILT = (
+    slice(0, 3),
+    slice(3, 6),
+    slice(6, 9),
+    slice(9, 12),
+    slice(12, 15),
+    slice(15, 16),
+    slice(16, 18),
+)
+N = 18
+_I3 = np.eye(3)
+
+
+def _no_innovation(_: Array) -> float:
+    return 0.0
+
+
+class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
+    """One filter: filterpy holds the error (always zero between updates) and P, the nominal state stands beside.
+
+    No array is ever changed in place, so that a shallow copy is a checkpoint.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(dim_x=N, dim_z=6)
+        self.x = np.zeros(N)
+        self.P = np.zeros((N, N))
+        self.rotation = np.eye(3)
+        self.velocity = np.zeros(3)
+        self.position = np.zeros(3)
+        self.gyro_bias = np.zeros(3)
+        self.accel_bias = np.zeros(3)
+        self.time_offset = 0.0
+        self.tilt = np.zeros(2)
+
+    def predict_x(self, u: Any = 0) -> None:
+        """The error stays zero; `move` carries the nominal state."""
+
+    @property
+    def up(self) -> Array:
+        """(3,): the vertical in the world frame."""
+        c = self.tilt
+        return np.array([c[0], c[1], math.sqrt(1.0 - c @ c)])
+
+    def move(self, gyro: Array, accel: Array, dt: float, noise: tuple[float, float, float, float]) -> None:
+        """Carry over `dt` s of constant rate and specific force; `noise`: densities of gyro, accel and their walks."""
+        turn = (gyro - self.gyro_bias) * dt
+        added = exp_so3(0.5 * turn) @ (accel - self.accel_bias) * dt  # Δv, in start axes
+        A = exp_so3(-turn)
+        C = -GRAVITY * dt * self.rotation.T[:, :2]
+        F = np.eye(N)
+        F[TH, DBG] = -dt * _I3
+        F[DV, TH] = -skew(added)
+        F[DV, DBA] = -dt * _I3
+        F[DV, DTILT] = C
+        F[DP, DV] = dt * _I3
+        F[DP, TH] = -0.5 * dt * skew(added)
+        F[DP, DBA] = -0.5 * dt * dt * _I3
+        F[DP, DTILT] = 0.5 * dt * C
+        F[:9] = np.kron(np.eye(3), A) @ F[:9]
+        Q = np.zeros((N, N))
+        angle, force, gyro_walk, accel_walk = (density**2 * dt for density in noise)
+        Q[TH, TH] = angle * _I3
+        Q[DV, DV] = force * _I3
+        Q[DP, DV] = Q[DV, DP] = 0.5 * dt * force * _I3
+        Q[DP, DP] = dt * dt / 3.0 * force * _I3
+        Q[DBG, DBG] = gyro_walk * _I3
+        Q[DBA, DBA] = accel_walk * _I3
+        self.F, self.Q = F, Q
+        self.predict()
+
+        kick = self.rotation @ added - GRAVITY * dt * self.up
+        self.position = self.position + (self.velocity + 0.5 * kick) * dt
+        self.velocity = self.velocity + kick
+        self.rotation = self.rotation @ exp_so3(turn)
+
+    def correct(self, H: Array, y: Array, R: Array) -> None:
+        """Update with innovation y, then move the nominal state by the error and reset it."""
+        self.update(y, lambda _: H, _no_innovation, R=R)
+        dx = self.x
+        self.x = np.zeros(N)
+        self.velocity = self.velocity + self.rotation @ dx[DV]
+        self.position = self.position + self.rotation @ dx[DP]
+        self.gyro_bias = self.gyro_bias + dx[DBG]
+        self.accel_bias = self.accel_bias + dx[DBA]
+        self.time_offset += float(dx[15])
+        self.tilt = self.tilt + dx[DTILT]
+        # Jr(φ) = I - (1 - cos φ)/φ² [φ]x + (φ - sin φ)/φ³ [φ]x²
+        turn = dx[TH]
+        angle, K = float(np.linalg.norm(turn)), skew(turn)
+        b, c = (0.5, 1.0 / 6.0)
+        if angle > 1e-4:
+            b, c = (1.0 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
+        J = np.eye(N)
+        J[TH, TH] = _I3 - b * K + c * K @ K
+        J[DV, DV] = J[DP, DP] = exp_so3(-turn)
+        P = J @ self.P @ J.T
+        self.P = 0.5 * (P + P.T)
+        # through the quaternion, which keeps the rotation one
+        self.rotation = rotation_from_quaternion(quaternion_from_rotation(self.rotation @ exp_so3(turn)))
+
+    def start(self, hypothesis: Array, velocity_sigma: float) -> None:
+        """Pose and its covariance from a fix; biases, time offset and tilt stay, uncorrelated with it."""
+        self.rotation = rotation_from_quaternion(hypothesis[k.H_QUAT : k.H_QUAT + 4])
+        self.position = hypothesis[k.H_POS : k.H_POS + 3].copy()
+        P = self.P.copy()
+        P[:9, :] = 0.0
+        P[:, :9] = 0.0
+        P[DV, DV] = velocity_sigma**2 * _I3
+        R = self._in_body(hypothesis)
+        P[DP, DP], P[TH, TH] = R[:3, :3], R[3:, 3:]
+        P[DP, TH], P[TH, DP] = R[:3, 3:], R[3:, :3]
+        self.P = P
+
+    def _in_body(self, hypothesis: Array) -> Array:
+        """(6, 6): a fix's covariance in body axes."""
+        turn = np.kron(np.eye(2), self.rotation.T)
+        R: Array = turn @ hypothesis[k.H_COV : k.H_COV + 36].reshape(6, 6) @ turn.T
+        return R
+
+    def fix_model(self, hypothesis: Array, rate: Array, jitter: float) -> tuple[Array, Array, Array]:
+        """H, y and R of a pose fix: position then attitude, in body axes."""
+        H = np.zeros((6, N))
+        H[:3, DP] = _I3
+        H[3:, TH] = _I3
+        motion = np.concatenate([self.rotation.T @ self.velocity, rate])
+        H[:, 15] = motion
+        y = np.concatenate(
+            [
+                self.rotation.T @ (hypothesis[k.H_POS : k.H_POS + 3] - self.position),
+                log_so3(self.rotation.T @ rotation_from_quaternion(hypothesis[k.H_QUAT : k.H_QUAT + 4])),
+            ]
+        )
+        return H, y, self._in_body(hypothesis) + jitter**2 * np.outer(motion, motion)
+
+
+def _d2(S: Array, y: Array) -> float:
+    return float(y @ np.linalg.solve(S, y))
+
+
+class _State:
+    """All that rewinds. Copied shallowly, filters included."""
+
+    def __init__(self) -> None:
+        self.main = ErrorStateFilter()
+        self.shadow: ErrorStateFilter | None = None
+        self.shadow_count = 0
+        self.shadow_since = 0.0
+        self.t = self.t_imu = self.t_accepted = -math.inf
+        self.u = np.zeros(6)
+        self.next_t = math.inf
+        self.next_u = np.zeros(6)
+        self.bridging = self.trailing = self.initialised = False
+        self.imu_cursor = self.fix_cursor = 0
+        self.td_applied = 0.0
+        self.reset_id = self.accepted_count = 0
+        self.accel_mean, self.accel_count = np.zeros(3), 0
+
+    def copy(self) -> _State:
+        other = copy.copy(self)
+        other.main = copy.copy(self.main)
+        other.shadow = copy.copy(self.shadow)
+        return other
+
+    @property
+    def filters(self) -> list[ErrorStateFilter]:
+        return [self.main] if self.shadow is None else [self.main, self.shadow]
+
+
+class ReferenceTimeline:
+    """Drop-in for `fusion.timeline.Timeline`, about a hundred times slower."""
+
+    def __init__(self, params: FilterParams, motion: Motion) -> None:
+        self._params = params
+        self._motion = motion
+        self._samples: list[tuple[float, ...]] = []
+        self._fixes: list[Array] = []
+        self._state = _State()
+        self._checkpoints = [self._state.copy()]
+        self._horizon = -math.inf
+        self._figures = {"imu_duplicates": 0, "imu_late": 0, "rewinds": 0}
+        self._waiting = 0
+
+    # --- the interface of Timeline
+
+    @property
+    def figures(self) -> dict[str, int]:
+        """See `Timeline.figures`."""
+        return dict(self._figures)
+
+    @property
+    def state(self) -> Array:
+        """(kernels.STATE,): the live filter in the kernels' layout."""
+        s = self._state
+        vector = np.zeros(k.STATE)
+        vector[k.Q : k.Q + 4] = quaternion_from_rotation(s.main.rotation)
+        vector[k.V : k.V + 3] = s.main.velocity
+        vector[k.POS : k.POS + 3] = s.main.position
+        vector[k.BG : k.BG + 3] = s.main.gyro_bias
+        vector[k.BA : k.BA + 3] = s.main.accel_bias
+        vector[k.TD] = s.main.time_offset
+        vector[k.TILT : k.TILT + 2] = s.main.tilt
+        vector[k.COV : k.COV + N * N] = s.main.P.ravel()
+        vector[k.T], vector[k.T_IMU], vector[k.T_ACCEPTED] = s.t, s.t_imu, s.t_accepted
+        vector[k.INITIALISED], vector[k.RESET_ID] = s.initialised, s.reset_id
+        return vector
+
+    def feed_samples(self, samples: Array, track: Array | None = None) -> int:
+        """See `Timeline.feed_samples`."""
+        kept = 0
+        for i, row in enumerate(samples.tolist()):
+            kept += self._insert_sample(tuple(row))
+            self._advance(self._state, math.inf, live=True)
+            if track is not None:
+                track[i] = np.nan
+                track[i, 0] = row[0]
+                if self._state.initialised:
+                    track[i, 1:4] = self._state.main.position
+                    track[i, 4:8] = quaternion_from_rotation(self._state.main.rotation)
+        return kept
+
+    def feed_fix(self, row: Array) -> int:
+        """See `Timeline.feed_fix`."""
+        key = self._fix_key(row)
+        place = bisect.bisect_left(self._fixes, key, key=self._fix_key)
+        if place < len(self._fixes) and self._fix_key(self._fixes[place]) == key:
+            return k.DUPLICATE
+        t = float(row[k.F_T])
+        if not self._precedes_fix(self._state, t, place) and not self._rewind(
+            t, lambda state: self._precedes_fix(state, t, place)
+        ):
+            return k.TOO_LATE
+        self._fixes.insert(place, row.copy())
+        self._waiting += 1
+        self._horizon = max(self._horizon, t)
+        self._advance(self._state, math.inf, live=True)
+        self._forget()
+        return k.PENDING
+
+    def judged(self) -> list[Array]:
+        """See `Timeline.judged`."""
+        rows = []
+        for row in self._fixes if self._waiting else []:
+            if row[k.F_OUTCOME] != k.PENDING and not row[k.F_REPORTED]:
+                row[k.F_REPORTED] = 1.0
+                rows.append(row.copy())
+        self._waiting -= len(rows)
+        return rows
+
+    def pose_at(self, t: float) -> Array | None:
+        """See `Timeline.pose_at`."""
+        fixes = self._fixes
+        if t >= self._state.t:
+            state = self._state.copy()
+            fixes = []
+        else:
+            earlier = [checkpoint for checkpoint in self._checkpoints if checkpoint.t <= t]
+            if not earlier:
+                return None
+            state = earlier[-1].copy()
+        self._advance(state, t, live=False)
+        if state.imu_cursor < len(self._samples) and t < self._state.t:
+            self._head_for(state, self._samples[state.imu_cursor])
+            self._run_to(state, t, fixes)
+        elif state.initialised or fixes:
+            state.next_t, state.next_u = math.inf, state.u
+            fresh = min(t, state.t_imu + self._params.imu_gap)
+            for bridging, leg in ((False, fresh), (True, t)):
+                state.bridging = bridging
+                if leg > state.t:
+                    self._run_to(state, leg, fixes)
+        if not state.initialised:
+            return None
+        return self._pose(state)
+
+    # --- the timeline
+
+    @staticmethod
+    def _fix_key(row: Array) -> list[float]:
+        return [row[k.F_T], *row[k.F_COUNT : k.F_OUTCOME].tolist()]
+
+    def _precedes_fix(self, state: _State, t: float, place: int) -> bool:
+        return state.fix_cursor <= place and state.t < t + state.td_applied
+
+    def _precedes_sample(self, state: _State, t: float) -> bool:
+        return state.t < t and (not state.trailing or t - state.t_imu > self._params.imu_gap)
+
+    def _rewind(self, t: float, precedes: Any) -> bool:
+        if t < self._horizon - self._params.buffer:
+            return False
+        for i in range(len(self._checkpoints) - 1, -1, -1):
+            if precedes(self._checkpoints[i]):
+                self._state = self._checkpoints[i].copy()
+                del self._checkpoints[i + 1 :]
+                self._figures["rewinds"] += 1
+                return True
+        return False
+
+    def _insert_sample(self, sample: tuple[float, ...]) -> bool:
+        t = sample[0]
+        place = bisect.bisect_right(self._samples, t, key=lambda present: present[0])
+        replaces = False
+        if place and self._samples[place - 1][0] == t:
+            self._figures["imu_duplicates"] += 1
+            replaces = sample < self._samples[place - 1]
+            if not replaces:
+                return False
+        in_order = place == len(self._samples) and not replaces and self._precedes_sample(self._state, t)
+        if not in_order and not self._rewind(t, lambda state: self._precedes_sample(state, t)):
+            self._figures["imu_late"] += 1
+            return False
+        self._samples[place - replaces : place] = [sample]
+        self._horizon = max(self._horizon, t)
+        return True
+
+    def _forget(self) -> None:
+        """Drop what lies too far back for any input to be put before it."""
+        oldest = self._horizon - 1.5 * self._params.buffer
+        keep = max(0, bisect.bisect_left(self._checkpoints, oldest, key=lambda state: state.t) - 1)
+        first = self._checkpoints[keep]
+        samples, fixes = first.imu_cursor, first.fix_cursor
+        if samples < 1000 and fixes < 100:
+            return  # seldom, and then much
+        del self._checkpoints[:keep]
+        del self._samples[:samples]
+        del self._fixes[:fixes]
+        for state in (self._state, *self._checkpoints):
+            state.imu_cursor -= samples
+            state.fix_cursor -= fixes
+
+    def _head_for(self, state: _State, sample: tuple[float, ...]) -> None:
+        state.next_t, state.next_u = sample[0], np.array(sample[1:])
+        state.bridging = sample[0] - state.t_imu > self._params.imu_gap
+
+    def _advance(self, state: _State, until: float, live: bool) -> None:
+        while True:
+            sample = None
+            if state.imu_cursor < len(self._samples) and self._samples[state.imu_cursor][0] <= until:
+                sample = self._samples[state.imu_cursor]
+                self._head_for(state, sample)
+                t = sample[0]
+            elif live and state.fix_cursor < len(self._fixes) and self._horizon > state.t_imu + self._params.imu_gap:
+                t = float(self._fixes[state.fix_cursor][k.F_T]) + state.td_applied
+                state.next_t, state.bridging = math.inf, True
+            else:
+                return
+            self._run_to(state, t, self._fixes)
+            state.trailing = sample is None
+            if sample is not None:
+                if state.initialised:
+                    grid = math.floor(t * k.GRID_HZ)
+                    if self._motion != "free" and (
+                        math.isinf(state.t_imu) or grid != math.floor(state.t_imu * k.GRID_HZ)
+                    ):
+                        for f in state.filters:
+                            self._constrain(f)
+                else:
+                    state.accel_count = min(state.accel_count + 1, 100)
+                    step = (np.array(sample[4:]) - state.accel_mean) / state.accel_count
+                    state.accel_mean = state.accel_mean + step
+                state.t_imu = t
+                state.imu_cursor += 1
+            if live and state.t - self._checkpoints[-1].t >= self._params.buffer / k.CP_PER_BUFFER:
+                self._checkpoints.append(state.copy())
+                if len(self._checkpoints) > 4 * k.CP_PER_BUFFER:
+                    self._forget()
+
+    def _run_to(self, state: _State, t_end: float, fixes: list[Array]) -> None:
+        p = self._params
+        while True:
+            t, fix = t_end, None
+            if state.fix_cursor < len(fixes) and fixes[state.fix_cursor][k.F_T] + state.td_applied <= t_end:
+                fix = fixes[state.fix_cursor]
+                t = float(fix[k.F_T]) + state.td_applied
+            dt = t - state.t
+            if dt > 0.0:
+                part = 1.0
+                if t < state.next_t and math.isfinite(state.t):
+                    part = dt / (state.next_t - state.t)
+                ahead = state.next_u if part == 1.0 else state.u + part * (state.next_u - state.u)
+                mean = 0.5 * (state.u + ahead)
+                for f in state.filters if state.initialised else []:
+                    if state.bridging:
+                        force = f.accel_bias + GRAVITY * f.rotation.T @ f.up
+                        noise = (p.no_imu_rate_noise, p.no_imu_accel_noise, p.gyro_bias_walk, p.accel_bias_walk)
+                        f.move(f.gyro_bias, force, dt, noise)
+                    else:
+                        noise = (p.gyro_noise, p.accel_noise, p.gyro_bias_walk, p.accel_bias_walk)
+                        f.move(mean[:3], mean[3:], dt, noise)
+                state.u = ahead
+                state.t = t
+            if fix is None:
+                return
+            if state.initialised:
+                self._judge(state, fix)
+            else:
+                self._initialise(state, fix)
+                fix[k.F_OUTCOME] = k.INIT
+            state.td_applied = state.main.time_offset
+            state.fix_cursor += 1
+
+    # --- measurements
+
+    @staticmethod
+    def _hypothesis(fix: Array, i: int) -> Array:
+        return fix[k.F_HYPOTHESES + i * k.HYPOTHESIS : k.F_HYPOTHESES + (i + 1) * k.HYPOTHESIS]
+
+    def _initialise(self, state: _State, fix: Array) -> None:
+        p = self._params
+        state.main = f = ErrorStateFilter()
+        hypothesis = self._hypothesis(fix, 0).copy()
+        if fix[k.F_COUNT] > 1:
+            lead = self._hypothesis(fix, 1)[k.H_MISFIT] - hypothesis[k.H_MISFIT]
+            if lead < p.hypothesis_margin:
+                for i in (3, 4):
+                    hypothesis[k.H_COV + 7 * i] += k.UNKNOWN_TILT_SIGMA**2
+        priors = [0.0] * 9 + [p.gyro_bias_sigma] * 3 + [p.accel_bias_sigma] * 3 + [p.time_offset_sigma]
+        f.P = np.diag([sigma**2 for sigma in (*priors, p.tilt_sigma, p.tilt_sigma)])
+        f.start(hypothesis, p.velocity_sigma)
+        state.initialised = True
+        state.accepted_count = 1
+        state.t_accepted = state.t
+        if state.accel_count:
+            force = GRAVITY * f.rotation.T @ f.up
+            H = np.zeros((3, N))
+            H[:, TH] = skew(force)
+            H[:, DBA] = _I3
+            H[:, DTILT] = GRAVITY * f.rotation.T[:, :2]
+            f.correct(H, state.accel_mean - force, k.GRAVITY_SIGMA**2 * _I3)
+
+    def _weigh(self, state: _State, f: ErrorStateFilter, fix: Array) -> tuple[Array, Array, Array, Array]:
+        """Choose the hypothesis, write the fix's figures. -> H, y, R, S."""
+        rate = np.zeros(3) if state.bridging else state.u[:3] - f.gyro_bias
+        scores = []
+        for i in range(int(fix[k.F_COUNT])):
+            H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
+            S = H @ f.P @ H.T + R
+            scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
+        chosen = int(np.argmin(scores))
+        margin = abs(scores[0] - scores[1]) if len(scores) == 2 else math.inf
+        H, y, R = f.fix_model(self._hypothesis(fix, chosen), rate, self._params.stamp_jitter)
+        if margin < self._params.hypothesis_margin:
+            B = f.rotation
+            R[3:, 3:] += k.UNKNOWN_TILT_SIGMA**2 * (np.outer(B[0], B[0]) + np.outer(B[1], B[1]))
+        S = H @ f.P @ H.T + R
+        fix[k.F_D2] = _d2(S, y)
+        fix[k.F_D2_POSITION] = _d2(S[:3, :3], y[:3])
+        fix[k.F_D2_ATTITUDE] = _d2(S[3:, 3:], y[3:])
+        fix[k.F_CHOSEN] = chosen
+        fix[k.F_MARGIN] = margin
+        fix[k.F_INNOVATION : k.F_INNOVATION + 6] = y
+        fix[k.F_SIGMA : k.F_SIGMA + 6] = np.sqrt(np.diag(S))
+        return H, y, R, S
+
+    def _judge(self, state: _State, fix: Array) -> None:
+        p = self._params
+        main = state.main
+        H, y, R, S = self._weigh(state, main, fix)
+        ratio = max(fix[k.F_D2] / p.gate, fix[k.F_D2_POSITION] / p.gate_block, fix[k.F_D2_ATTITUDE] / p.gate_block)
+        if ratio <= p.gate_inflation:
+            fix[k.F_OUTCOME] = k.ACCEPTED
+            if ratio > 1.0:
+                fix[k.F_OUTCOME] = k.INFLATED
+                R = R + (ratio - 1.0) * S
+            main.correct(H, y, R)
+            state.shadow, state.shadow_count = None, 0
+            state.accepted_count += 1
+            state.t_accepted = state.t
+            return
+        fix[k.F_OUTCOME] = k.REJECTED
+        figures = fix[k.F_D2 : k.F_REPORTED].copy()
+        if state.shadow is not None:
+            H, y, R, _ = self._weigh(state, state.shadow, fix)
+            agrees = fix[k.F_D2] <= p.reinit_gate
+            fix[k.F_D2 : k.F_REPORTED] = figures
+            if agrees:
+                state.shadow.correct(H, y, R)
+                state.shadow_count += 1
+                if state.shadow_count >= p.reinit_count and (
+                    state.accepted_count < p.reinit_count
+                    or state.t - state.shadow_since >= p.reinit_patience
+                    or self._attitudes_agree(main, state.shadow)
+                ):
+                    state.main, state.shadow, state.shadow_count = state.shadow, None, 0
+                    state.accepted_count = p.reinit_count
+                    state.reset_id += 1
+                    state.t_accepted = state.t
+                    fix[k.F_OUTCOME] = k.REINIT
+                return
+        shadow = copy.copy(main)
+        shadow.start(self._hypothesis(fix, int(fix[k.F_CHOSEN])), p.velocity_sigma)
+        shadow.velocity = shadow.rotation @ main.rotation.T @ main.velocity
+        state.shadow, state.shadow_count, state.shadow_since = shadow, 1, state.t
+
+    def _attitudes_agree(self, main: ErrorStateFilter, shadow: ErrorStateFilter) -> bool:
+        y = log_so3(main.rotation.T @ shadow.rotation)
+        return _d2(main.P[TH, TH] + shadow.P[TH, TH], y) <= self._params.gate_block
+
+    def _constrain(self, f: ErrorStateFilter) -> None:
+        p = self._params
+        up = f.rotation.T[:, 2]
+        speed = f.rotation.T @ f.velocity
+        H, y = np.zeros((4, N)), np.zeros(4)
+        H[0, DV] = up
+        y[0] = -f.velocity[2]
+        H[1:3, TH] = skew(up)[:2]
+        y[1:3] = -up[:2]
+        H[3, TH] = skew(speed)[1]
+        H[3, 4] = 1.0
+        y[3] = -speed[1]
+        sigmas = [p.ground_velocity_sigma, p.ground_tilt_sigma, p.ground_tilt_sigma, p.wheel_velocity_sigma]
+        m = 4 if self._motion == "differential" else 3
+        f.correct(H[:m], y[:m], np.diag(np.square(sigmas[:m])))
+
+    def _pose(self, state: _State) -> Array:
+        f = state.main
+        out = np.empty(k.POSE)
+        out[k.P_T] = state.t
+        out[k.P_POS : k.P_POS + 3] = f.position
+        out[k.P_QUAT : k.P_QUAT + 4] = quaternion_from_rotation(f.rotation)
+        out[k.P_VEL : k.P_VEL + 3] = f.velocity
+        out[k.P_RATE : k.P_RATE + 3] = 0.0 if state.bridging else state.u[:3] - f.gyro_bias
+        turn = np.kron(np.eye(2), f.rotation)
+        order = np.r_[6:9, 0:3]
+        out[k.P_COV : k.P_COV + 36] = (turn @ f.P[np.ix_(order, order)] @ turn.T).ravel()
+        out[k.P_VCOV : k.P_VCOV + 9] = (f.rotation @ f.P[DV, DV] @ f.rotation.T).ravel()
+        out[k.P_T_ACCEPTED], out[k.P_RESET_ID], out[k.P_T_IMU] = state.t_accepted, state.reset_id, state.t_imu
+        return out
