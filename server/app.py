@@ -272,7 +272,7 @@ class Service:
                 robot.dropped += parser.dropped - dropped
                 robot.trouble = f"it sends what cannot be used: {parser.last_error}"
             if self.ready.is_set():
-                robot.feed_imu(samples, arrival)
+                robot.feed_imu(samples, arrival, time.monotonic())
 
         def end(error: OSError) -> None:
             if not lost.done():
@@ -481,7 +481,8 @@ class Service:
             if self._links.get(hello.robot) is link:
                 del self._links[hello.robot]
                 robot.trouble = "its connection has ended"
-                log.info("robot %s has gone", hello.robot)
+                if self._server is not None and self._server.is_serving():
+                    log.info("robot %s has gone", hello.robot)
 
     async def _hello(self, visitor: _Visitor) -> Hello:
         async for data in visitor.connection:
@@ -512,7 +513,7 @@ class Service:
             case Imu() as message:
                 samples = raw_samples(message)
                 if self.ready.is_set():
-                    robot.feed_imu(samples, arrival)
+                    robot.feed_imu(samples, arrival, arrival)
             case ClockAnswer(id, received, sent):
                 asked = link.questions.pop(id, None)
                 if asked is None:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from fusion.localiser import Localiser
+import numpy as np
 
-from fusion.measurements import ImuBatch, Pose, PoseFix
+from fusion.localiser import Localiser
+from fusion.measurements import Array, ImuBatch, Pose, PoseFix
 from imu.clock import DeviceClock
 from imu.protocols import RawSample
 from server.config import RobotConfig
@@ -21,11 +22,14 @@ RATE_WINDOW = 2.0
 
 
 class Recording(Protocol):
-    """What a robot writes to while it runs: every input in the order in which the filter gets it, and the poses."""
+    """What a robot writes to while it runs: every input, in the order in which the filter gets it, and what came of it.
+
+    `server.recording.Recorder` is one.
+    """
 
     def imu(self, batch: ImuBatch) -> None: ...
     def fix(self, fix: PoseFix) -> None: ...
-    def pose(self, pose: Pose) -> None: ...
+    def track(self, robot: str, track: Array) -> None: ...
 
 
 class Robot:
@@ -49,8 +53,11 @@ class Robot:
         self.clock = DeviceClock()
         self.trouble = "it has connected, but sent no IMU data yet"
 
-    def feed_imu(self, raw: Sequence[RawSample], arrival: float) -> None:
-        """Readings that reached the service together."""
+    def feed_imu(self, raw: Sequence[RawSample], arrival: float, now: float) -> None:
+        """Readings that reached the service together at `arrival`, and the filter now.
+
+        The order in which inputs reach the filter is what a recording keeps as the order of their arrivals.
+        """
         if not raw:
             return
         self.trouble = ""
@@ -58,14 +65,18 @@ class Robot:
         self._arrivals.append((arrival, len(raw)))
         while self._arrivals[0][0] < arrival - RATE_WINDOW:
             self._arrivals.popleft()
-        batch = ImuBatch(self.config.name, arrival, self.clock.stamp(raw, arrival))
-        if self._recording is not None:
+        batch = ImuBatch(self.config.name, now, self.clock.stamp(raw, arrival))
+        if self._recording is None:
+            self.localiser.feed(batch)
+        else:
+            track = np.full((len(raw), 8), np.nan)
             self._recording.imu(batch)
-        self.localiser.feed(batch)
+            self.localiser.feed(batch, track)
+            self._recording.track(self.config.name, track)
 
-    def feed_fix(self, fix: PoseFix, arrival: float) -> None:
-        """`arrival` counts from now: the order in which inputs reach the filter is the order of their arrivals."""
-        fix = replace(fix, arrival=arrival)
+    def feed_fix(self, fix: PoseFix, now: float) -> None:
+        """A fix, which counts as arrived now."""
+        fix = replace(fix, arrival=now)
         if self._recording is not None:
             self._recording.fix(fix)
         self.localiser.feed(fix)
@@ -75,8 +86,6 @@ class Robot:
         pose = self.localiser.pose_at(now)
         if pose is not None:
             self.published += 1
-            if self._recording is not None:
-                self._recording.pose(pose)
         return pose
 
     def encode(self, pose: Pose, now: float) -> bytes:

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import signal
 import sys
+from pathlib import Path
 
 import cv2
 import msgspec
@@ -22,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", nargs="?", metavar="CONFIG.toml", help="without it: a simulated room to look at")
     parser.add_argument("--host", help="address to listen on, instead of the configured one")
     parser.add_argument("--port", type=int, help="port to listen on, instead of the configured one; 0 for any free one")
-    parser.add_argument("--record", metavar="FOLDER", help="keep all inputs there, for `steadfix replay`")
+    parser.add_argument("--record", type=Path, metavar="FOLDER", help="keep all inputs there, for `steadfix replay`")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -18,10 +18,12 @@ const MODES = {
   LOST: ["lost", "bad", "Neither fixes nor IMU data"],
 };
 
+const UNKNOWN = new Set(["INIT", "INVALID", "LOST"]);
+
 const element = (id) => document.getElementById(id);
 const seconds = () => performance.now() / 1000;
 
-const robots = new Map(); // name -> {pose, received, trail, colour}
+const robots = new Map(); // name -> {pose, place, received, trail, colour}; place: the last pose that means anything
 let health = null;
 let socket = null;
 let retry = 0;
@@ -68,15 +70,20 @@ function take(pose) {
   const before = robot.pose;
   const trail = robot.trail;
   if (before && pose.t < before.t) trail.length = 0; // the service has started anew
-  trail.push({ t: pose.t, x: pose.position[0], y: pose.position[1], gap: !before || pose.reset_id !== before.reset_id });
-  while (trail[0].t < pose.t - TRAIL_S) trail.shift();
+  // Of a robot that is lost the filter only knows that it may be anywhere: it stays where it was last seen.
+  if (!UNKNOWN.has(pose.mode)) {
+    const gap = robot.place !== before || pose.reset_id !== before?.reset_id;
+    trail.push({ t: pose.t, x: pose.position[0], y: pose.position[1], gap });
+    robot.place = pose;
+  }
+  while (trail.length && trail[0].t < pose.t - TRAIL_S) trail.shift();
   robot.pose = pose;
   robot.received = seconds();
   dirty = true;
 }
 
 function robotNamed(name) {
-  if (!robots.has(name)) robots.set(name, { pose: null, received: 0, trail: [], colour: robots.size % 6 });
+  if (!robots.has(name)) robots.set(name, { pose: null, place: null, received: 0, trail: [], colour: robots.size % 6 });
   return robots.get(name);
 }
 
@@ -155,10 +162,10 @@ function showTables() {
     row.className = silent > STALE_S ? "stale" : "";
     mode.title = meaning;
     setCell(mode, word, silent > STALE_S && pose ? "" : kind);
-    setCell(speed, pose ? Math.hypot(pose.velocity[0], pose.velocity[1]).toFixed(2) : "–");
+    setCell(speed, pose && !UNKNOWN.has(pose.mode) ? Math.hypot(pose.velocity[0], pose.velocity[1]).toFixed(2) : "–");
     const fixAge = pose?.fix_age == null ? null : pose.fix_age + silent;
     setCell(age, fixAge === null ? "–" : aged(fixAge), fixAge === null ? "" : fixAge < 1.5 ? "good" : fixAge < 5 ? "fair" : "bad");
-    setCell(sigma, pose ? short(2000 * ellipse(pose.covariance).major) : "–");
+    setCell(sigma, pose && !UNKNOWN.has(pose.mode) ? short(2000 * ellipse(pose.covariance).major) : "–");
   }
   for (const [name, camera] of Object.entries(health?.cameras ?? {})) {
     const row = rowFor("cameras", name, ["name", "", "number", "number"]);
@@ -176,8 +183,8 @@ function showTables() {
   }
 }
 
-const aged = (s) => (s < 9.95 ? s.toFixed(1) : s < 999 ? s.toFixed(0) : "999+");
-const short = (mm) => (mm < 9.95 ? mm.toFixed(1) : mm < 9999 ? mm.toFixed(0) : "9999+");
+const aged = (s) => (s < 99.95 ? s.toFixed(1) : s < 999 ? s.toFixed(0) : "999+");
+const short = (mm) => (mm < 99.95 ? mm.toFixed(1) : mm < 9999 ? mm.toFixed(0) : "9999+");
 
 // Semi-axes of one sigma (m) and the direction of the larger one, of a pose's covariance on the floor.
 function ellipse(covariance) {
@@ -221,7 +228,7 @@ function fit() {
   const points = [];
   for (const anchor of health?.anchors ?? []) points.push(anchor.position_m);
   for (const camera of Object.values(health?.cameras ?? {})) points.push(...(camera.view_m ?? []));
-  for (const { pose } of robots.values()) if (pose) points.push(pose.position);
+  for (const { place } of robots.values()) if (place) points.push(place.position);
   const grown = bounds ?? { left: Infinity, right: -Infinity, bottom: Infinity, top: -Infinity };
   const before = JSON.stringify(grown);
   for (const [x, y] of points) {
@@ -252,13 +259,13 @@ function draw() {
   context.clearRect(0, 0, width, height);
   context.font = "600 14px system-ui, sans-serif";
   context.textBaseline = "middle";
-  context.lineJoin = context.lineCap = "round";
+  context.lineJoin = "round";
 
   drawGrid(width, height, toX, toY);
   for (const [name, camera] of Object.entries(health?.cameras ?? {})) drawCamera(name, camera, toX, toY);
   for (const anchor of health?.anchors ?? []) drawAnchor(anchor, toX, toY);
-  for (const robot of robots.values()) if (robot.pose) drawTrail(robot, toX, toY);
-  for (const [name, robot] of robots) if (robot.pose) drawRobot(name, robot, toX, toY);
+  for (const robot of robots.values()) if (robot.trail.length) drawTrail(robot, toX, toY);
+  for (const [name, robot] of robots) if (robot.place) drawRobot(name, robot, toX, toY);
 }
 
 function drawGrid(width, height, toX, toY) {
@@ -282,6 +289,16 @@ function drawGrid(width, height, toX, toY) {
     const y = Math.round(toY(i * step)) + 0.5;
     line(i === 0, 0, y, width, y);
   }
+  // The world's axes, at its origin.
+  context.lineWidth = 2;
+  context.strokeStyle = colours.soft;
+  context.beginPath();
+  context.moveTo(toX(0), toY(0) - 34);
+  context.lineTo(toX(0), toY(0));
+  context.lineTo(toX(0) + 34, toY(0));
+  context.stroke();
+  label("x", toX(0) + 39, toY(0), colours.soft, "13px");
+  label("y", toX(0) - 4, toY(0) - 43, colours.soft, "13px");
   element("scale-bar").style.width = `${step * view.scale}px`;
   setText(element("scale-text"), `${step} m`);
 }
@@ -305,7 +322,7 @@ function drawCamera(name, camera, toX, toY) {
   context.beginPath();
   context.arc(x, y, 3.5, 0, 2 * Math.PI);
   context.stroke();
-  label(`${name}, ${camera.position_m[2].toFixed(2)} m up`, x + 16, y, colours.soft, "13px");
+  label(`${name}, ${camera.position_m[2].toFixed(2)} m up`, x + 16, y + 14, colours.soft, "13px");
 }
 
 function drawAnchor(anchor, toX, toY) {
@@ -340,8 +357,9 @@ function drawTrail(robot, toX, toY) {
 }
 
 function drawRobot(name, robot, toX, toY) {
-  const { pose } = robot;
-  const stale = seconds() - robot.received > STALE_S || socket === null;
+  const pose = robot.place;
+  const lost = robot.pose !== pose;
+  const stale = lost || seconds() - robot.received > STALE_S || socket === null;
   const colour = stale ? colours.soft : colours[`robot-${robot.colour}`];
   const x = toX(pose.position[0]);
   const y = toY(pose.position[1]);
@@ -371,11 +389,12 @@ function drawRobot(name, robot, toX, toY) {
   context.stroke();
   context.fill();
   context.restore();
-  label(name, x + r * 1.25 + 8, y - r * 0.9, colour, "15px");
+  label(lost ? `${name} was here` : name, x + r * 1.25 + 8, y - r * 0.9, colour, "16px");
 }
 
 function label(text, x, y, colour, size) {
   context.font = `600 ${size} system-ui, sans-serif`;
+  x = Math.min(x, canvas.clientWidth - context.measureText(text).width - 6);
   // A halo in the floor's colour keeps it readable over lines.
   context.strokeStyle = colours.floor;
   context.lineWidth = 4;

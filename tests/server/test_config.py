@@ -108,7 +108,7 @@ def test_the_example_is_accepted_with_everything_in_it_switched_on() -> None:
         ('calibration = "camera.toml"\n', "", ['"calibration" is missing', "example-camera.toml"]),
         ('source = "room.mp4"', "source = 1.5", ["found 1.5", "rtsp://"]),
         ("[[anchor]]\nid = 40\nsize_mm = 150\nposition_m = [0, 0, 0]\n", "", ["cameras need anchors"]),
-        ('source = "/dev/ttyUSB0"', 'source = "/dev/ttyUSB0"\nprotocol = "xml"', ["protocol", '"xml"', '"json" or "csv"']),
+        ('source = "/dev/ttyUSB0"', 'source = "/dev/ttyUSB0"\nprotocol = "xml"', ['"xml"', '"json" or "csv"']),
         ("port = 0", "port = ", ["not valid TOML", "line 3"]),
     ],
 )  # fmt: skip

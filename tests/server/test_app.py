@@ -1,0 +1,566 @@
+"""The service on real sockets: what it answers, and what it survives."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import socket
+import time
+import tty
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed
+
+from camera.calibration import CalibrationError, Intrinsics, save_intrinsics
+from fusion.measurements import Array, ImuBatch, Pose, PoseFix
+from server.app import Service
+from server.config import CameraConfig, Config, ConfigError, parse
+from tests.server.room import (
+    CAMERA,
+    CONFIG,
+    INTRINSICS,
+    Ceiling,
+    client,
+    fix,
+    get,
+    health,
+    heard,
+    hello,
+    imu,
+    run,
+    serving,
+    until,
+)
+
+# Plain requests
+
+
+def test_plain_requests() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            status, kind, text = await get(service, "/")
+            assert (status, kind) == (200, "text/html; charset=utf-8")
+            assert "<canvas" in text
+            assert (await get(service, "/dashboard.js"))[:2] == (200, "text/javascript; charset=utf-8")
+            assert (await get(service, "/dashboard.css"))[:2] == (200, "text/css; charset=utf-8")
+            assert await get(service, "/", "HEAD") == (200, "text/html; charset=utf-8", "")
+            for path in ("/nothing", "/../server/app.py", "/dashboard.js/"):
+                status, _, text = await get(service, path)
+                assert status == 404
+                assert "/healthz" in text
+                assert "/v1/poses" in text
+            assert (await get(service, "/v1/poses"))[0] == 426
+            assert (await get(service, "/", "DELETE"))[0] == 405
+
+    run(main)
+
+
+def test_health() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            found = await health(service)
+            assert found["status"] == "degraded"
+            assert found["reasons"][0] == "robot rover: no IMU has connected yet"
+            assert found["robots"]["rover"]["mode"] == "INIT"
+            assert found["robots"]["rover"]["fix_age"] is None
+            service.robots["rover"].feed_fix(fix(), time.monotonic())
+            found = await health(service)
+            assert found["robots"]["rover"]["mode"] == "NO_IMU"
+            assert 0.04 < found["robots"]["rover"]["fix_age"] < 10.0
+            assert found["robots"]["rover"]["counts"]["initialised"] == 1
+
+    run(main)
+
+
+# Poses
+
+
+def test_poses_of_all_robots_or_of_some() -> None:
+    async def main() -> None:
+        async with (
+            serving() as service,
+            client(service, "/v1/poses") as all_,
+            client(service, "/v1/poses?robots=cart&rate=20") as some,
+        ):
+            service.robots["rover"].feed_fix(fix("rover", x=1.0), time.monotonic())
+            service.robots["cart"].feed_fix(fix("cart", x=3.0), time.monotonic())
+            seen = {}
+            while len(seen) < 2:
+                pose = await heard(all_, "pose")
+                seen[pose["robot"]] = pose
+            assert seen["rover"]["position"][0] == pytest.approx(1.0)
+            assert seen["cart"]["frame"] == "world"
+            assert len(seen["cart"]["covariance"]) == 36
+            poses = [await heard(some, "pose") for _ in range(10)]
+            assert {pose["robot"] for pose in poses} == {"cart"}
+            assert [pose["seq"] for pose in poses] == sorted({pose["seq"] for pose in poses})
+            # 20 Hz, or less on a slow machine, but never the 100 Hz of the service.
+            assert poses[-1]["t"] - poses[0]["t"] > 8 / 20
+
+    run(main)
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("robots=rover,tank", 'there is no robot "tank" in the configuration; known: rover, cart'),
+        ("rate=fast", "rate=fast"),
+        ("rate=-1", "rate=-1"),
+        ("rate=nan", "rate=nan"),
+        ("format=msgpack", "robots=a,b and rate=50 are"),
+    ],
+)
+def test_poses_that_cannot_be_had(query: str, expected: str) -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, f"/v1/poses?{query}") as connection:
+            assert expected in (await heard(connection, "error"))["reason"]
+            with pytest.raises(ConnectionClosed) as closed:
+                await connection.recv()
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1008
+
+    run(main)
+
+
+# Robots
+
+
+def test_a_robot_sends_its_imu_and_gets_its_pose() -> None:
+    async def main() -> None:
+        published: list[Pose] = []
+        recording = Recording()
+        async with serving(recording=recording, published=published.append) as service:
+            async with client(service, "/v1/robot") as connection:
+                welcome = await hello(connection, pose_rate_hz=50)
+                assert welcome["type"] == "welcome"
+                assert welcome["robot"] == "rover"
+                assert welcome["service"].startswith("steadfix ")
+                assert welcome["pose_rate_hz"] == 50
+                # Its own clock: another origin.
+                offset = 1000.0 - time.monotonic()
+                await connection.send(imu(time.monotonic() + offset))
+                await until(lambda: service.robots["rover"].localiser.counts["imu_samples"] == 10)
+                service.robots["rover"].feed_fix(fix(), time.monotonic())
+                questions = 0
+                poses = []
+                while len(poses) < 20 or questions < 3:
+                    message = await heard(connection)
+                    if message["type"] == "clock":
+                        questions += 1
+                        now = time.monotonic() + offset
+                        answer = {"type": "clock", "id": message["id"], "received": now, "sent": now}
+                        await connection.send(json.dumps(answer))
+                    elif message["type"] == "pose":
+                        poses.append(message)
+                        await connection.send(imu(time.monotonic() + offset))
+                assert {pose["robot"] for pose in poses} == {"rover"}
+                assert poses[-1]["mode"] == "FULL"
+                # Within the exchange's round trip, of which nothing is known on a busy machine.
+                assert poses[-1]["t_robot"] == pytest.approx(poses[-1]["t"] + offset, abs=0.2)
+                found = (await health(service))["robots"]["rover"]
+                assert found["imu"] == "ok"
+                assert found["imu_rate_hz"] > 0.0
+                assert found["link_delay_ms"] >= 0.0
+            await until(lambda: service.robots["rover"].trouble == "its connection has ended")
+        assert len(published) == service.robots["rover"].published
+        assert sum(len(track) for track in recording.tracks) == sum(len(batch.samples) for batch in recording.batches)
+        assert np.isfinite(recording.tracks[-1]).all()
+        assert len(recording.fixes) == 1
+        arrivals = [batch.arrival for batch in recording.batches]
+        assert arrivals == sorted(arrivals)
+        assert all((batch.samples[:, 0] <= batch.arrival).all() for batch in recording.batches)
+
+    run(main)
+
+
+class Recording:
+    """Keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.batches: list[ImuBatch] = []
+        self.fixes: list[PoseFix] = []
+        self.tracks: list[Array] = []
+        self.imu, self.fix = self.batches.append, self.fixes.append
+
+    def track(self, robot: str, track: Array) -> None:
+        self.tracks.append(track)
+
+
+def test_no_more_poses_than_the_service_publishes() -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            assert (await hello(connection, pose_rate_hz=400))["pose_rate_hz"] == 100
+
+    run(main)
+
+
+def test_a_robot_that_is_not_known() -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            error = await hello(connection, "tank")
+            assert error["reason"] == 'there is no robot "tank" in the configuration; known: rover, cart'
+            with pytest.raises(ConnectionClosed):
+                await connection.recv()
+
+    run(main)
+
+
+def test_a_second_robot_of_one_name_is_refused_while_the_first_is_there() -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as first:
+            await hello(first)
+            async with client(service, "/v1/robot") as second:
+                error = await hello(second)
+                assert error["type"] == "error"
+                assert 'robot "rover" is already connected' in error["reason"]
+            await first.send(imu(5.0))
+            await until(lambda: service.robots["rover"].localiser.counts["imu_samples"] == 10)
+
+    run(main)
+
+
+def test_a_silent_connection_gives_way_to_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.app.SILENCE", 0.0)
+
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as first:
+            await hello(first)
+            async with client(service, "/v1/robot") as second:
+                assert (await hello(second))["type"] == "welcome"
+                await first.wait_closed()
+                await second.send(imu(5.0))
+                await until(lambda: service.robots["rover"].localiser.counts["imu_samples"] == 10)
+                assert service.robots["rover"].trouble == ""
+
+    run(main)
+
+
+# Rubbish
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        ("rubbish", "malformed"),
+        (b"\x00" * 100, "a binary message of 100 bytes"),
+        ("[" * 60_000, "Expected `object`"),
+        ('{"type":"imu","samples":"none"}', "Expected `array`, got `str` - at `$.samples`"),
+        ('{"type":"imu","samples":[[0,0,0,0,0,0,NaN]]}', "neither NaN nor Infinity"),
+        ('{"type":"imu","samples":[[0,1e9,0,0,0,0,0]]}', "out of range"),
+        ('{"type":"imu","samples":[[1e300,0,0,0,0,0,0]]}', "out of range"),
+        ('{"type":"clock","id":99,"received":0,"sent":0}', "which was not asked"),
+        ('{"type":"hello","robot":"cart"}', "a second hello"),
+    ],
+)
+def test_rubbish_is_answered_counted_and_survived(data: str | bytes, expected: str) -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            await hello(connection)
+            await connection.send(data)
+            assert expected in (await heard(connection, "error"))["reason"]
+            found = await health(service)
+            assert found["messages_refused"] == 1
+            assert found["robots"]["rover"]["imu_refused"] == 1
+            # The connection is as good as before.
+            await connection.send(imu(5.0))
+            await until(lambda: service.robots["rover"].localiser.counts["imu_samples"] == 10)
+
+    run(main)
+
+
+def test_before_the_hello_nothing_else_is_heard() -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            await connection.send(imu(5.0))
+            assert "the first message must be" in (await heard(connection, "error"))["reason"]
+            assert (await hello(connection))["type"] == "welcome"
+
+    run(main)
+
+
+def test_ten_megabytes() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            # Not `async with`: the service closes this connection while the client still sends.
+            connection = await client(service, "/v1/robot")
+            await hello(connection)
+            with contextlib.suppress(ConnectionClosed):
+                await connection.send("x" * 10_000_000)
+            await connection.wait_closed()
+            assert connection.close_code in (1006, 1009)
+            await until(lambda: service.refused == 1)
+            async with client(service, "/v1/robot") as connection:
+                assert (await hello(connection))["type"] == "welcome"
+
+    run(main)
+
+
+def test_what_is_no_http_at_all() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            for data in (
+                b"\x16\x03\x01\x02\x00\x01\x00",
+                b"GET\r\n\r\n",
+                b"POST / HTTP/1.1\r\nContent-Length: 5\r\n\r\n12345",
+            ):
+                reader, writer = await asyncio.open_connection("127.0.0.1", service.port)
+                writer.write(data)
+                writer.write_eof()
+                await reader.read()
+                writer.close()
+                await writer.wait_closed()
+            assert (await get(service, "/"))[0] == 200
+
+    run(main)
+
+
+# Clients that go away, or do not keep up
+
+
+def test_clients_that_vanish() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            service.robots["rover"].feed_fix(fix(), time.monotonic())
+            async with client(service, "/v1/poses") as other:
+                for path in ("/v1/poses", "/v1/robot", "/"):
+                    async with client(service, path) as connection:
+                        if path == "/v1/robot":
+                            await hello(connection)
+                        connection.transport.abort()
+                await until(lambda: len(service.hub.subscriptions) == 1)
+                await heard(other, "pose")
+
+    run(main)
+
+
+def test_a_client_that_does_not_read_is_cut_off_and_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.hub.STALL_LIMIT", 0.3)
+
+    async def main() -> None:
+        config = CONFIG.replace("pose_rate_hz = 100", "pose_rate_hz = 1000")
+        async with serving(config) as service:
+            service.robots["rover"].feed_fix(fix(), time.monotonic())
+            with socket.socket() as stalled:
+                # A small window, so that it does not take megabytes to fill.
+                stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+                stalled.setblocking(False)
+                await asyncio.get_running_loop().sock_connect(stalled, ("127.0.0.1", service.port))
+                key = "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+                request = f"GET /v1/poses HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n{key}\r\n"
+                await asyncio.get_running_loop().sock_sendall(stalled, request.encode())
+                await until(lambda: len(service.hub.subscriptions) == 1)
+                async with client(service, "/v1/poses?rate=100") as other:
+                    last = 0
+                    while service.hub.cut_off == 0:
+                        assert max(s.waiting() for s in service.hub.subscriptions) < 100_000
+                        last = (await heard(other, "pose"))["seq"]
+                    assert service.hub.dropped > 0
+                    await until(lambda: len(service.hub.subscriptions) == 1)
+                    assert (await heard(other, "pose"))["seq"] > last
+
+    run(main)
+
+
+def test_a_port_in_use() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            with pytest.raises(OSError, match=f"port {service.port} on 127.0.0.1 is in use"):
+                async with serving(CONFIG.replace("port = 0", f"port = {service.port}")):
+                    pass
+
+    run(main)
+
+
+def test_ending_tells_the_clients() -> None:
+    async def main() -> None:
+        async with contextlib.AsyncExitStack() as clients:
+            async with serving() as service:
+                connection = await clients.enter_async_context(client(service, "/v1/poses"))
+            with pytest.raises(ConnectionClosed) as closed:
+                await connection.recv()
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1001
+
+    run(main)
+
+
+# Cameras
+
+
+@pytest.fixture
+def camera_config(tmp_path: Path) -> Config:
+    save_intrinsics(tmp_path / "camera.toml", INTRINSICS)
+    return parse(CONFIG + CAMERA, folder=tmp_path)
+
+
+def test_a_camera_locates_itself_and_the_robot(camera_config: Config) -> None:
+    async def main() -> None:
+        async with serving(camera_config, open_camera=Ceiling) as service, client(service, "/v1/poses") as connection:
+            pose = await heard(connection, "pose")
+            assert pose["robot"] == "rover"
+            assert pose["position"] == pytest.approx([0.3, 0.2, 0.0], abs=0.01)
+            assert pose["yaw"] == pytest.approx(0.5, abs=0.02)
+            found = await health(service)
+            ceiling = found["cameras"]["ceiling"]
+            assert ceiling["status"] == "ok"
+            assert ceiling["located"]
+            assert ceiling["position_m"] == pytest.approx([0.0, 0.0, 2.5], abs=0.01)
+            assert ceiling["markers"] == [7, 40, 41]
+            # 640 px at a focal length of 500 px from 2.5 m.
+            outline = np.array(ceiling["view_m"])
+            assert np.ptp(outline, axis=0) == pytest.approx([3.2, 2.4], abs=0.1) or np.ptp(
+                outline, axis=0
+            ) == pytest.approx([2.4, 3.2], abs=0.1)
+            assert [anchor["id"] for anchor in found["anchors"]] == [40, 41]
+
+    run(main)
+
+
+def test_the_original_trackers_stream(camera_config: Config) -> None:
+    async def main() -> None:
+        async with serving(camera_config, open_camera=Ceiling) as service, client(service, "/") as connection:
+            await connection.send("what a client sends is ignored")
+            seen = {}
+            while len(seen) < 3:
+                data = await connection.recv()
+                assert isinstance(data, str)
+                message = json.loads(data)
+                assert data == json.dumps(message)
+                assert list(message) == ["id", "x", "y", "bearing"]
+                seen[message["id"]] = message
+            assert set(seen) == {"7", "40", "41"}
+            # Where a pinhole at 2.5 m sees the marker 0.1 m up.
+            camera_from_world = np.linalg.inv(Ceiling.WORLD_FROM_CAMERA)
+            x, y, z, _ = camera_from_world @ [0.3, 0.2, 0.1, 1.0]
+            assert seen["7"]["x"] == pytest.approx(500.0 * x / z + 319.5, abs=1.5)
+            assert seen["7"]["y"] == pytest.approx(500.0 * y / z + 239.5, abs=1.5)
+            R = camera_from_world[:3, :3] @ Ceiling.WORLD_FROM_BODY[:3, :3]
+            bearing = math.degrees(math.atan2(R[1, 0], R[0, 0])) % 360.0
+            assert seen["7"]["bearing"] == pytest.approx(bearing, abs=2.0)
+            assert isinstance(seen["7"]["x"], int)
+
+    run(main)
+
+
+def test_a_camera_that_is_not_there(camera_config: Config) -> None:
+    async def main() -> None:
+        async with serving(camera_config) as service:
+            await until(lambda: "nothing.mp4" in service.cameras["ceiling"].status)
+            found = await health(service)
+            assert any("camera ceiling: " in reason and "nothing.mp4" in reason for reason in found["reasons"])
+            assert not found["cameras"]["ceiling"]["located"]
+
+    run(main)
+
+
+def test_a_camera_that_is_lost_is_opened_again(camera_config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.cameras.FIRST_PAUSE", 0.01)
+    opened: list[Ceiling] = []
+
+    def open_camera(config: CameraConfig) -> Ceiling:
+        opened.append(Ceiling(config, frames=3))
+        return opened[-1]
+
+    async def main() -> None:
+        async with serving(camera_config, open_camera=open_camera):
+            await until(lambda: len(opened) >= 3)
+
+    run(main)
+    assert len(opened) >= 3
+
+
+def test_a_frame_of_another_size_than_the_calibration(tmp_path: Path) -> None:
+    other = Intrinsics(INTRINSICS.camera_matrix, INTRINSICS.distortion, 1280, 960)
+    save_intrinsics(tmp_path / "camera.toml", other)
+
+    async def main() -> None:
+        async with serving(parse(CONFIG + CAMERA, folder=tmp_path), open_camera=Ceiling) as service:
+            await until(lambda: "640 x 480" in service.cameras["ceiling"].status)
+
+    run(main)
+
+
+def test_a_camera_without_calibration(tmp_path: Path) -> None:
+    async def main() -> None:
+        with pytest.raises(CalibrationError, match=r"no calibration file .*camera\.toml.*example-camera"):
+            Service(parse(CONFIG + CAMERA, folder=tmp_path))
+
+    run(main)
+
+
+def test_a_dictionary_that_is_not_known(tmp_path: Path) -> None:
+    save_intrinsics(tmp_path / "camera.toml", INTRINSICS)
+    config = (CONFIG + CAMERA).replace('name = "ceiling"', 'name = "ceiling"\ndictionary = "5X5"')
+
+    async def main() -> None:
+        with pytest.raises(ConfigError, match=r'camera "ceiling".*5X5'):
+            Service(parse(config, folder=tmp_path))
+
+    run(main)
+
+
+# Serial lines
+
+
+@pytest.fixture
+def serial_line() -> Any:
+    """(our end, name of the service's end) of a pty."""
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    try:
+        yield ours, os.ttyname(theirs)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_a_robot_on_a_serial_line(serial_line: tuple[int, str]) -> None:
+    ours, name = serial_line
+    config = CONFIG.replace('name = "cart"', f'name = "cart"\nimu = {{source = "{name}", pose_rate_hz = 50}}')
+
+    async def main() -> None:
+        async with serving(config) as service:
+            cart = service.robots["cart"]
+            await until(lambda: cart.trouble.startswith("it has connected"))
+            os.write(ours, b"rubbish\n")
+            await until(lambda: cart.dropped == 1)
+            assert "cannot be used" in cart.trouble
+            for i in range(10):
+                sample = {"t": 7.0 + 0.005 * i, "gyro": [0.0, 0.0, 0.0], "accel": [0.0, 0.0, 9.81]}
+                os.write(ours, json.dumps(sample).encode() + b"\n")
+            await until(lambda: cart.localiser.counts["imu_samples"] == 10)
+            assert cart.trouble == ""
+            cart.feed_fix(fix("cart"), time.monotonic())
+            line = (await asyncio.to_thread(_read_line, ours)).decode()
+            pose = json.loads(line)
+            assert pose["type"] == "pose"
+            assert pose["robot"] == "cart"
+            assert pose["t_robot"] == pytest.approx(7.0, abs=30.0)
+            async with client(service, "/v1/robot") as connection:
+                assert "is on /dev/" in (await hello(connection, "cart"))["reason"]
+
+    run(main)
+
+
+def _read_line(fd: int) -> bytes:
+    line = b""
+    while not line.endswith(b"\n"):
+        line += os.read(fd, 1)
+    return line
+
+
+def test_a_serial_port_that_is_not_there() -> None:
+    config = CONFIG.replace('name = "cart"', 'name = "cart"\nimu = {source = "/dev/nothing"}')
+
+    async def main() -> None:
+        async with serving(config) as service:
+            await until(lambda: "/dev/nothing" in service.robots["cart"].trouble)
+            assert "is the device plugged in?" in service.robots["cart"].trouble
+
+    run(main)
