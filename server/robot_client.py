@@ -30,8 +30,8 @@ log = logging.getLogger("steadfix.robot")
 
 # s before connecting again: the first pause, which doubles up to the longest.
 FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
-# s of silence after which a connection is asked for a sign of life, and then given up.
-PING = 5.0
+# s between asking the service for a sign of life, and until a connection without one is given up.
+PING_INTERVAL, PING_TIMEOUT = 2.0, 3.0
 # Samples in one message, at most.
 BATCH = 200
 
@@ -135,7 +135,12 @@ class Robot:
             welcome = False
             try:
                 async with connect(
-                    self._url, compression=None, max_size=1 << 16, ping_interval=PING, ping_timeout=PING, proxy=None
+                    self._url,
+                    compression=None,
+                    max_size=1 << 16,
+                    ping_interval=PING_INTERVAL,
+                    ping_timeout=PING_TIMEOUT,
+                    proxy=None,
                 ) as connection:
                     await connection.send(encode(Hello(self.name, self._pose_rate_hz)), text=True)
                     async for message in connection:

@@ -17,7 +17,7 @@ import random
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 
@@ -33,7 +33,7 @@ BATCH = 5
 POSE_RATE_HZ = 20.0
 # s: a pose of an older instant is not steered by.
 STALE = 0.5
-# m from the robot to the point of its course that it heads for; rad/s and m/s2 that it allows itself in bends.
+# m from the robot along its course to the point that it heads for; rad/s that it allows itself.
 LOOK_AHEAD = 0.2
 MAX_TURN_RATE = 3.0
 # m from the course at which the robot looks for it anew.
@@ -173,7 +173,7 @@ async def drive(link: Link, clock: DeviceClock, course: Course, seed: str) -> No
         body.command(*driver.steer(link.pose, link.pose_age, time.monotonic()))
 
 
-async def _main(args: Any) -> None:
+async def _main(args: argparse.Namespace) -> None:
     seed = f"{args.name} {args.seed}"
     clock = DeviceClock(seed)
     path = course(args.course)
