@@ -115,12 +115,17 @@ _SMALLEST_SIDE_PX = 6.0
 
 # What a marker must reach, from 1 200 quadrilaterals around rendered markers (small, blurred, dark, moving, tilted) and
 # 16 000 in 30 photographs without one, in 8 dictionaries.
-# Correlation of cell means with the best marker before the corners are measured, and after
-_FIRST_LOOK, _CELLS = 0.55, 0.85
+# Shortest side over cells, px
+_CELL_PX = 1.0
+# Correlation of cell means with the best marker
+_CELLS = 0.85
 # What the best marker leaves unexplained, as a part of what the next best leaves
 _AHEAD = 0.45
-# Correlation of the picture within the cells: thin strokes can have the right means, but not this
-_PICTURE = 0.84
+# The same two before the corners are measured
+_FIRST_LOOK = 0.65, 0.9
+# Correlation of the picture within the cells: thin strokes can have the right means, but not this. The second where
+# the sides show no clear edge and OpenCV reads no marker.
+_PICTURE, _PICTURE_UNCLEAR = 0.84, 0.9
 
 # In a stream, frames between two full searches while a marker is missing
 _SEARCH_EVERY = 10
@@ -140,7 +145,7 @@ class MarkerDetector:
         if ids is not None and (unknown := sorted(id for id in ids if not 0 <= id < size)):
             raise ValueError(f"dictionary {dictionary} has the ids 0 to {size - 1}, not {unknown}")
         self.ids = None if ids is None else frozenset(ids)
-        self._decoder = _Decoder(self._dictionary, range(size) if ids is None else sorted(self.ids or ()))
+        self._decoder = _Decoder(self._dictionary)
         self._detector = cv2.aruco.ArucoDetector(self._dictionary, cv2.aruco.DetectorParameters())
         self._equaliser = cv2.createCLAHE(4.0, (8, 8))
         self._first = len(_PASSES) - 1
@@ -200,8 +205,10 @@ class MarkerDetector:
         if not decoded and not others:
             return []
         quads = np.array([*decoded, *others], np.float64).reshape(-1, 4, 2)
+        by_opencv = np.arange(len(quads)) < len(decoded)
         # Middles of pixels are at whole numbers, and a scaled image's edges, not its middles, coincide.
-        return self._decoder.read(picture, (quads + 0.5) / way.scale - 0.5)
+        found = self._decoder.read(picture, (quads + 0.5) / way.scale - 0.5, by_opencv)
+        return [marker for marker in found if self.ids is None or marker.id in self.ids]
 
     def _sightings(self, found: list[_Found], t: float, camera: str) -> list[MarkerSighting]:
         return [
@@ -223,17 +230,17 @@ def _distinct(found: list[_Found]) -> list[_Found]:
     kept: list[_Found] = []
     for marker in sorted(found, key=lambda marker: (marker.sigma_px, -marker.score)):
         middle = marker.corners_px.mean(axis=0)
-        if all(
-            np.linalg.norm(middle - other.corners_px.mean(axis=0))
-            > 0.5 * min(_shortest_side(marker.corners_px), _shortest_side(other.corners_px))
-            for other in kept
-        ):
+        apart = 0.5 * float(_shortest_sides(marker.corners_px[None])[0])
+        if all(np.hypot(*(middle - other.corners_px.mean(axis=0))) > apart for other in kept):
             kept.append(marker)
     return kept
 
 
-def _shortest_side(corners_px: Array) -> float:
-    return float(np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).min())
+def _shortest_sides(quads: Array) -> Array:
+    """(n, 4, 2) -> (n,) px"""
+    sides = quads[:, [1, 2, 3, 0]] - quads
+    shortest: Array = np.sqrt(np.square(sides).sum(axis=-1)).min(axis=1)
+    return shortest
 
 
 # Samples per cell and axis
@@ -245,11 +252,12 @@ _BLURS = (0.1, 0.35, 0.6, 0.9)
 class _Decoder:
     """Reads quadrilaterals by likeness: normalised correlation with all markers, in all turns, at several blurs."""
 
-    def __init__(self, dictionary: cv2.aruco.Dictionary, ids: Collection[int]) -> None:
+    def __init__(self, dictionary: cv2.aruco.Dictionary) -> None:
         bits = dictionary.markerSize
-        self.ids = np.array(list(ids))
         self.cells = bits + 2
-        rows = [dictionary.bytesList[id : id + 1] for id in self.ids]
+        # All of the dictionary, whatever ids are wanted: an unwanted marker must not be taken for the wanted one that
+        # is most like it.
+        rows = [dictionary.bytesList[id : id + 1] for id in range(len(dictionary.bytesList))]
         inner = np.array([cv2.aruco.Dictionary.getBitsFromByteList(row, bits) for row in rows], np.float64)
         # Black border, then two cells of white paper for the blur to reach into
         self._codes = np.pad(
@@ -271,10 +279,14 @@ class _Decoder:
         x, y = np.meshgrid(middles, middles)
         self._places = np.stack([x, y], axis=-1).reshape(1, -1, 2)
 
-    def read(self, image: Image, quads: Array) -> list[_Found]:
-        """The markers among quadrilaterals (n, 4, 2) px, each at most once."""
-        # A rough look first: measuring corners costs more, and most of what a textured floor yields is none.
-        quads = quads[self._best(self._samples(image, quads))[3] >= _FIRST_LOOK]
+    def read(self, image: Image, quads: Array, decoded: NDArray[np.bool_]) -> list[_Found]:
+        """The markers among quadrilaterals (n, 4, 2) px, each place at most once. `decoded` (n,): those that OpenCV
+        could read, of which less is demanded."""
+        # A rough look first: measuring corners costs more, and most of what a textured floor yields is no marker.
+        _, _, ahead, likeness = self._best(self._samples(image, quads))
+        worth = (likeness >= _FIRST_LOOK[0]) & (ahead <= _FIRST_LOOK[1])
+        worth &= decoded | (_shortest_sides(quads) >= _CELL_PX * self.cells)
+        quads, decoded = quads[worth], decoded[worth]
         if not len(quads):
             return []
         corners, sigma = refine_corners(image, quads, self.cells)
@@ -283,14 +295,15 @@ class _Decoder:
         found = []
         for k in np.flatnonzero((likeness >= _CELLS) & (ahead <= _AHEAD)):
             score = self._likeness(samples[k], marker[k], turn[k])
-            if score >= _PICTURE:
-                ordered = np.roll(corners[k], turn[k], axis=0)
-                found.append(_Found(int(self.ids[marker[k]]), ordered, float(sigma[k]), score))
+            if score >= (_PICTURE if decoded[k] or sigma[k] < SIGMA_UNREFINED_PX else _PICTURE_UNCLEAR):
+                found.append(_Found(int(marker[k]), np.roll(corners[k], turn[k], axis=0), float(sigma[k]), score))
         return _distinct(found)
 
     def _samples(self, image: Image, quads: Array) -> NDArray[np.float32]:
         """(n, rows, columns) grey values inside each quadrilateral, seen straight on."""
         side = self.cells * _PER_CELL
+        if not len(quads):
+            return np.zeros((0, side, side), np.float32)
         places = [
             cv2.perspectiveTransform(self._places, cv2.getPerspectiveTransform(_UNIT, quad.astype(np.float32)))
             for quad in quads
@@ -358,30 +371,29 @@ def refine_corners(image: Image, corners_px: Array, cells: int) -> tuple[Array, 
     SIGMA_UNREFINED_PX.
     """
     start = np.asarray(corners_px, dtype=np.float64)
-    cell = np.linalg.norm(np.roll(start, -1, axis=1) - start, axis=2).min(axis=1) / cells
+    cell = np.maximum(_shortest_sides(start) / cells, 1e-9)
     # Half a profile stays within the black border inside and the white margin outside, each a cell wide.
     reach = np.clip(0.8 * cell, 1.5, 12.0)
-    corners, _, width, clear = _refine_once(image, start, reach)
+    corners, _, blur, clear = _refine_once(image, start, reach)
     # Again: the detector's corners may be off by pixels, and a profile that is not centred pulls its edge to its own
     # middle. Three sigma of the edge's own blur hold all of it, and a shorter profile is sampled more finely.
-    corners, noise, width, still_clear = _refine_once(image, corners, np.clip(3.0 * width, 1.5, 0.75 * reach + 0.4))
+    shorter = np.clip(3.0 * blur.max(axis=1), 1.5, 0.75 * reach + 0.4)
+    corners, noise, blur, still_clear = _refine_once(image, corners, shorter)
     clear &= still_clear & (np.linalg.norm(corners - start, axis=2).max(axis=1) <= np.maximum(reach, 2.0))
     # Blur beyond a sixth of a cell brings the next cells' edges into the profile: measured on rendered markers of 13 to
     # 70 px under blur of 0.5 to 5 px, the corners' error grows as this, which is an upper bound for most of them.
-    crowding = 18.0 * cell * np.square(np.maximum(width / np.maximum(cell, 1e-9) - 0.16, 0.0))
-    sigma = np.sqrt(SIGMA_FLOOR_PX**2 + noise**2 + crowding**2)
-    return (
-        np.where(clear[:, None, None], corners, start),
-        np.where(clear, sigma, np.maximum(sigma, SIGMA_UNREFINED_PX)),
-    )
+    crowding = 18.0 * cell[:, None] * np.square(np.maximum(blur / cell[:, None] - 0.16, 0.0))
+    sigma = np.sqrt(SIGMA_FLOOR_PX**2 + noise**2 + np.square(crowding).mean(axis=1))
+    sigma = np.where(clear, sigma, np.maximum(sigma, SIGMA_UNREFINED_PX))
+    return np.where(clear[:, None, None], corners, start), sigma
 
 
 def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """(n, 4, 2) corners, (n,) their sigma by the edges' scatter, (n,) sigma of the edges' blur, and whether every leg
-    had enough clear edges. `reach` (n,): half of a profile's length, px."""
+    """(n, 4, 2) corners, (n,) their sigma by the edges' scatter, (n, 8) sigma of the blur of each leg's edge, and
+    whether every leg had enough clear edges. `reach` (n,): half of a profile's length, px."""
     n = len(corners)
     # Two legs from each corner: to the next corner and to the one before. (n, 4, 2 legs, xy)
-    leg = np.stack([np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)], axis=2) - corners[:, :, None]
+    leg = np.stack([corners[:, [1, 2, 3, 0]], corners[:, [3, 0, 1, 2]]], axis=2) - corners[:, :, None]
     length = np.maximum(np.linalg.norm(leg, axis=-1), 1e-9)
     along = leg / length[..., None]
     # Out of the square, whose corners run clockwise in an image with y down: left of the one leg, right of the other.
@@ -405,7 +417,7 @@ def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Arr
     edge = (rise @ between) / total
     spread = np.sqrt(np.maximum((rise @ between**2) / total - edge**2, 0.0))
     edge *= reach[:, None, None, None]
-    width = np.median(spread, axis=(1, 2, 3)) * reach
+    blur = np.median(spread, axis=-1).reshape(n, 8) * reach[:, None]
     fifth = _SAMPLES // 5
     contrast = profile[..., -fifth:].mean(axis=-1) - profile[..., :fifth].mean(axis=-1)
     valid = (contrast > 0.4 * np.median(contrast, axis=(1, 2, 3), keepdims=True)) & (contrast > 2.0)
@@ -433,7 +445,7 @@ def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Arr
     cross = v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]
     between_lines = (q - p)[..., 0] * w[..., 1] - (q - p)[..., 1] * w[..., 0]
     met = p + (between_lines / np.where(np.abs(cross) < 1e-9, 1e-9, cross))[..., None] * v
-    return met, sigma, width, (support > 0.4 * _PROFILES).all(axis=(1, 2))
+    return met, sigma, blur, (support > 0.4 * _PROFILES).all(axis=(1, 2))
 
 
 def _median_where(values: Array, valid: NDArray[np.bool_]) -> Array:
