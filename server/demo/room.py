@@ -24,9 +24,9 @@ from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
-from camera.capture import Frame
 
 from camera.calibration import load_intrinsics
+from camera.capture import Frame
 from camera.markers import Image
 from camera.synthetic import Room, straight_down
 from fusion.geometry import exp_so3, rotation_about_z, transform, wrap
@@ -52,6 +52,8 @@ HISTORY = 5.0
 
 # t, x, y, yaw
 Truth = tuple[float, float, float, float]
+# robot, t, position (3,), quaternion wxyz (4,)
+RecordTruth = Callable[[str, float, Array, Array], None]
 
 
 class DemoRoom:
@@ -69,8 +71,8 @@ class DemoRoom:
     The robots end with this process however it ends, since nobody reads their truth any more.
     """
 
-    def __init__(self, seed: int = 1) -> None:
-        self.record_truth: Callable[[str, float, Array, Array], None] | None = None
+    def __init__(self, record_truth: RecordTruth | None = None, seed: int = 1) -> None:
+        self.record_truth = record_truth
         self._seed = seed
         self._robots: dict[str, subprocess.Popen[bytes]] = {}
         self._truth: dict[str, list[Truth]] = {name: [] for name in COURSES}
