@@ -56,7 +56,7 @@ T_ACCEPTED = AUX + 13  # s: capture time of the last accepted fix
 ACCEPTED_COUNT = AUX + 14  # fixes accepted since the last (re)start
 TRAILING = AUX + 15  # 1 when T is a fix beyond the last IMU sample
 SHADOW_COUNT = AUX + 16  # fixes that the shadow agrees with; 0: there is none
-SHADOW_SINCE = AUX + 17  # s: the first of them
+REJECTED_SINCE = AUX + 17  # s: the first reject since the last accepted fix
 ACCEL_MEAN = AUX + 18  # running mean of the specific force before the start (3)
 ACCEL_COUNT = AUX + 21
 NEXT_T = AUX + 22  # s: stamp of the IMU sample that the state is on its way to
@@ -84,7 +84,7 @@ STATE = AUX + 30
     IMU_GAP,
     NO_IMU_ACCEL_NOISE,
     NO_IMU_RATE_NOISE,
-    REINIT_GATE,
+    REINIT_ANGLE,
     REINIT_COUNT,
     REINIT_PATIENCE,
     GROUND_VELOCITY_SIGMA,
@@ -173,7 +173,7 @@ def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias
     """Carry the filter at s[o:] over `dt` s of constant angular rate and specific force, both raw.
 
     With Δv, Δp what specific force adds to velocity and position, in the body axes at the *start*, A = Exp(-ω dt) and
-    C = -g dt R̂ᵀ[e_x e_y], the error goes, up to O(dt²),
+    C = -g dt R̂ᵀ∂u/∂c, u = (c, √(1 - c²)) the vertical, the error goes, up to O(dt²),
 
         δθ' = A (δθ - dt δbg)
         δv' = A (δv - Δv × δθ - dt δba + C δc)
@@ -206,7 +206,8 @@ def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias
     g = -GRAVITY * dt
     k0 = r00 * d0 + r01 * d1 + r02 * d2 + g * c0
     k1 = r10 * d0 + r11 * d1 + r12 * d2 + g * c1
-    k2 = r20 * d0 + r21 * d1 + r22 * d2 + g * math.sqrt(1.0 - c0 * c0 - c1 * c1)
+    c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
+    k2 = r20 * d0 + r21 * d1 + r22 * d2 + g * c2
     s[o + POS] += (s[o + V] + 0.5 * k0) * dt
     s[o + POS + 1] += (s[o + V + 1] + 0.5 * k1) * dt
     s[o + POS + 2] += (s[o + V + 2] + 0.5 * k2) * dt
@@ -225,7 +226,9 @@ def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias
     a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
     a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
     a02, a12, a22 = 2.0 * (ex * ez - ew * ey), 2.0 * (ey * ez + ew * ex), 1.0 - 2.0 * (ex * ex + ey * ey)
-    c00, c01, c10, c11, c20, c21 = g * r00, g * r10, g * r01, g * r11, g * r02, g * r12
+    t0, t1 = c0 / c2, c1 / c2
+    c00, c10, c20 = g * (r00 - t0 * r20), g * (r01 - t0 * r21), g * (r02 - t0 * r22)
+    c01, c11, c21 = g * (r10 - t1 * r20), g * (r11 - t1 * r21), g * (r12 - t1 * r22)
     c = o + COV
     # F P Fᵀ as F (F P)ᵀ: the same loop twice, over columns that lie side by side in memory. The second round is needed
     # for the first nine columns only, since F leaves the rest alone.
@@ -485,9 +488,18 @@ def _weigh(s, o, prm, fix, H, y, R, S):
 
 
 @_jit
-def _start(s, o, prm, fix, k):
-    """Pose and covariance of the filter at s[o:] from the hypothesis at fix[k:]; biases, offset and tilt stay."""
+def _start(s, o, prm, fix, k, afresh):
+    """Pose and covariance of the filter at s[o:] from the hypothesis at fix[k:]; the rest stays, or starts afresh."""
     c = o + COV
+    if afresh:
+        for i in range(BLOCK):
+            s[o + i] = 0.0
+        for i in range(3):
+            s[c + (N + 1) * (DBG + i)] = prm[GYRO_BIAS_SIGMA] ** 2
+            s[c + (N + 1) * (DBA + i)] = prm[ACCEL_BIAS_SIGMA] ** 2
+        s[c + (N + 1) * DTD] = prm[TIME_OFFSET_SIGMA] ** 2
+        for i in range(2):
+            s[c + (N + 1) * (DTILT + i)] = prm[TILT_SIGMA] ** 2
     for i in range(DBG):
         for j in range(N):
             s[c + N * i + j] = 0.0
@@ -498,6 +510,7 @@ def _start(s, o, prm, fix, k):
     _matrix(s, o, B)
     for i in range(3):
         s[o + POS + i] = fix[k + H_POS + i]
+        s[o + V + i] = 0.0
         s[c + (N + 1) * (DV + i)] = prm[VELOCITY_SIGMA] * prm[VELOCITY_SIGMA]
     # from world into body axes; the fix's halves are (position, attitude), the filter's are (DP, TH)
     for i in range(6):
@@ -512,21 +525,13 @@ def _start(s, o, prm, fix, k):
 @_jit
 def _initialise(s, prm, fix):
     """Start from the first fix; gravity then corrects a tilt that a flat marker knows badly."""
-    for i in range(BLOCK):
-        s[i] = 0.0
     if fix[F_COUNT] > 1.0:
         other = fix[F_HYPOTHESES + HYPOTHESIS + H_MISFIT] - fix[F_HYPOTHESES + H_MISFIT]
         if other < prm[HYPOTHESIS_MARGIN]:
             fix = fix.copy()
             for i in range(3, 5):
                 fix[F_HYPOTHESES + H_COV + 7 * i] += UNKNOWN_TILT_SIGMA * UNKNOWN_TILT_SIGMA
-    _start(s, MAIN, prm, fix, F_HYPOTHESES)
-    for i in range(3):
-        s[COV + (N + 1) * (DBG + i)] = prm[GYRO_BIAS_SIGMA] ** 2
-        s[COV + (N + 1) * (DBA + i)] = prm[ACCEL_BIAS_SIGMA] ** 2
-    s[COV + (N + 1) * DTD] = prm[TIME_OFFSET_SIGMA] ** 2
-    for i in range(2):
-        s[COV + (N + 1) * (DTILT + i)] = prm[TILT_SIGMA] ** 2
+    _start(s, MAIN, prm, fix, F_HYPOTHESES, True)
     s[INITIALISED] = 1.0
     s[ACCEPTED_COUNT] = 1.0
     s[T_ACCEPTED] = s[T]
@@ -535,7 +540,7 @@ def _initialise(s, prm, fix):
     # mean specific force = g R̂ᵀu + b_a, u up: H = [g u_b]x on attitude, 1 on bias, g R̂ᵀ[e_x e_y] on tilt
     B = np.empty((3, 3))
     _matrix(s, MAIN, B)
-    H, y, R = np.zeros((3, N)), np.empty(3), np.zeros((3, 3))
+    H, y, R, S = np.zeros((3, N)), np.empty(3), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):
         y[i] = s[ACCEL_MEAN + i] - GRAVITY * B[2, i]
         H[i, DBA + i] = 1.0
@@ -544,7 +549,15 @@ def _initialise(s, prm, fix):
         R[i, i] = GRAVITY_SIGMA * GRAVITY_SIGMA
         H[i, (i + 1) % 3] = -GRAVITY * B[2, (i + 2) % 3]
         H[i, (i + 2) % 3] = GRAVITY * B[2, (i + 1) % 3]
-    update(s, MAIN, H, y, R)
+    for i in range(3):
+        for j in range(3):
+            S[i, j] = R[i, j]
+            for m in range(N):
+                for n in range(N):
+                    S[i, j] += H[i, m] * s[COV + N * m + n] * H[j, n]
+    # A fix whose tilt gravity denies is likely wrong: then nothing is to be learnt of the biases from it.
+    if _distance(S, y, 0, 3)[0] <= prm[GATE_BLOCK]:
+        update(s, MAIN, H, y, R)
 
 
 @_jit
@@ -554,6 +567,7 @@ def _judge(s, prm, fix):
     The way back: a rejected fix starts a shadow filter, which runs on the same IMU and takes the rejects that follow.
     When enough in a row agree with it, and its attitude with the gyro's, it takes over. A marker entered wrongly in
     the map gives long runs that agree with each other but not with the gyro; those must last longer than any such run.
+    After that long without an accepted fix the filter starts anew from any: it is never locked out for good.
     """
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     fix[F_OUTCOME] = REJECTED
@@ -562,19 +576,17 @@ def _judge(s, prm, fix):
     figures = fix[F_D2:F_REPORTED].copy()
     for o in range(MAIN, SHADOW + 1 if shadows else SHADOW, BLOCK):
         _weigh(s, o, prm, fix, H, y, R, S)
-        ratio = fix[F_D2] / prm[REINIT_GATE]
+        blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
+        ratio = max(fix[F_D2] / prm[GATE], blocks)
         if o == MAIN:
             figures[:] = fix[F_D2:F_REPORTED]
-            blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
-            ratio = max(fix[F_D2] / prm[GATE], blocks)
-            if ratio > 1.0 and ratio <= prm[GATE_INFLATION]:
-                # as if the fix were less certain, until it just passes
-                R += (ratio - 1.0) * S
-                ratio = 1.0
-                fix[F_OUTCOME] = INFLATED
-            elif ratio <= 1.0:
-                fix[F_OUTCOME] = ACCEPTED
-        if ratio <= 1.0 and update(s, o, H, y, R):
+            fix[F_OUTCOME] = INFLATED if ratio > 1.0 else ACCEPTED
+        if ratio > prm[GATE_INFLATION]:
+            continue
+        if ratio > 1.0:
+            # as if the fix were less certain, until it just passes
+            R += (ratio - 1.0) * S
+        if update(s, o, H, y, R):
             if o == MAIN:
                 s[SHADOW_COUNT] = 0.0
                 s[ACCEPTED_COUNT] += 1.0
@@ -583,36 +595,36 @@ def _judge(s, prm, fix):
             agrees = True
     fix[F_OUTCOME] = REJECTED
     fix[F_D2:F_REPORTED] = figures
+    if not shadows:
+        s[REJECTED_SINCE] = s[T]
+    patient = s[T] - s[REJECTED_SINCE] >= prm[REINIT_PATIENCE]
+    known = s[ACCEPTED_COUNT] >= prm[REINIT_COUNT]
     if agrees:
         s[SHADOW_COUNT] += 1.0
-        trusted = s[ACCEPTED_COUNT] < prm[REINIT_COUNT] or s[T] - s[SHADOW_SINCE] >= prm[REINIT_PATIENCE]
-        if s[SHADOW_COUNT] >= prm[REINIT_COUNT]:
-            # Is the shadow's attitude what the gyro made of the attitude since the last accepted fix?
-            _rotation_vector(s, MAIN, s, SHADOW, y, 0)
-            for i in range(3):
-                for j in range(3):
-                    S[i, j] = s[COV + N * i + j] + s[SHADOW + COV + N * i + j]
-            if trusted or _distance(S, y, 0, 3)[0] <= prm[GATE_BLOCK]:
-                s[MAIN:SHADOW] = s[SHADOW:AUX]
-                s[SHADOW_COUNT] = 0.0
-                s[ACCEPTED_COUNT] = prm[REINIT_COUNT]
-                s[RESET_ID] += 1.0
-                s[T_ACCEPTED] = s[T]
-                fix[F_OUTCOME] = REINIT
-        return
-    before, after = np.empty((3, 3)), np.empty((3, 3))
-    s[SHADOW:AUX] = s[MAIN:SHADOW]
-    _start(s, SHADOW, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS)
-    # The robot still moves as it did, seen from itself: turn the velocity with the body.
-    _matrix(s, MAIN, before)
-    _matrix(s, SHADOW, after)
-    for i in range(3):
-        s[SHADOW + V + i] = 0.0
-        for k in range(3):
-            body = before[0, k] * s[V] + before[1, k] * s[V + 1] + before[2, k] * s[V + 2]
-            s[SHADOW + V + i] += after[i, k] * body
-    s[SHADOW_COUNT] = 1.0
-    s[SHADOW_SINCE] = s[T]
+        # Is the shadow's attitude what the gyro made of the attitude since the last accepted fix?
+        _rotation_vector(s, MAIN, s, SHADOW, y, 0)
+        for i in range(3):
+            for j in range(3):
+                S[i, j] = s[COV + N * i + j] + s[SHADOW + COV + N * i + j]
+        angle = math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+        as_gyro = _distance(S, y, 0, 3)[0] <= prm[GATE_BLOCK] or (
+            # with noise set too small nothing ever agrees; a map entry is not wrong by a little
+            s[SHADOW_COUNT] >= 2.0 * prm[REINIT_COUNT] and angle <= prm[REINIT_ANGLE]
+        )
+        take = s[SHADOW_COUNT] >= prm[REINIT_COUNT] and (as_gyro or patient or not known)
+    else:
+        s[SHADOW:AUX] = s[MAIN:SHADOW]
+        # A filter that only its first fixes vouch for has no biases worth keeping.
+        _start(s, SHADOW, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
+        s[SHADOW_COUNT] = 1.0
+        take = patient
+    if take:
+        s[MAIN:SHADOW] = s[SHADOW:AUX]
+        s[ACCEPTED_COUNT] = s[SHADOW_COUNT]
+        s[SHADOW_COUNT] = 0.0
+        s[RESET_ID] += 1.0
+        s[T_ACCEPTED] = s[T]
+        fix[F_OUTCOME] = REINIT
 
 
 @_jit
@@ -921,8 +933,9 @@ FEED_SAMPLES, FEED_FIX, POSE_AT = range(3)
 def process(memory, task, t, inputs, outputs):
     """The one entry into compiled code: each further one would cost seconds of compilation.
 
-    FEED_SAMPLES: `inputs` (n, 7) are IMU samples; into `outputs` (n, 8), or (0, 8), goes the pose after each: stamp,
-    position, quaternion wxyz, NaN before the start. -> number of samples kept.
+    FEED_SAMPLES: `inputs` (n, 7) are IMU samples; into `outputs` (n, 8), or (0, 8), goes the newest pose after each:
+    its instant, which is the sample's stamp unless that came late, position, quaternion wxyz, NaN before the start.
+    -> number of samples kept.
     FEED_FIX: `inputs` (1, FIX). -> PENDING, TOO_LATE or DUPLICATE; how it was judged stands in its row of the ring.
     POSE_AT: `outputs` (1, POSE) is the pose at `t`, from all inputs so far. -> 0 before the start and the buffer.
     """
@@ -962,7 +975,7 @@ def process(memory, task, t, inputs, outputs):
             answer = _insert_fix(state, prm, fixes, checkpoints, meta, inputs[i])
         _advance(s, prm, imu, fixes, checkpoints, meta, until, live)
         if task == FEED_SAMPLES and i < outputs.shape[0]:
-            outputs[i, 0] = inputs[i, 0]
+            outputs[i, 0] = s[T]
             for j in range(3):
                 outputs[i, 1 + j] = s[POS + j] if s[INITIALISED] > 0.0 else math.nan
             for j in range(4):
@@ -981,10 +994,10 @@ def process(memory, task, t, inputs, outputs):
         else:
             s[NEXT_T] = math.inf
             s[NEXT_U : NEXT_U + 6] = s[U : U + 6]
-            s[BRIDGING] = leg
-            if leg == 0:
-                t_leg = min(t, s[T_IMU] + prm[IMU_GAP])
+            t_leg = t if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
         if t_leg > s[T] and s[INITIALISED] + fix_end > 0.0:
+            if not between:
+                s[BRIDGING] = leg
             _run_to(s, prm, fixes, fix_end, t_leg)
     if not s[INITIALISED] > 0.0:
         return 0

@@ -86,8 +86,8 @@ class Localiser:
     def feed_samples(self, samples: Array, track: Array | None = None) -> None:
         """IMU samples (n, 7) as in `ImuBatch`, unchecked.
 
-        `track` (n, 8) receives the pose as it is known when each sample has arrived: t, position, quaternion wxyz,
-        NaN before the first fix.
+        `track` (n, 8) receives the newest pose as it is known when each sample has arrived: its instant (the sample's
+        stamp, unless that came late), position, quaternion wxyz; NaN before the first fix.
         """
         self._samples += len(samples)
         self._timeline.feed_samples(samples, track)

@@ -39,8 +39,9 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     """rad/s: prior of the gyroscope bias at the first fix."""
     accel_bias_sigma: NotNegative = 0.2
     """m/s2: prior of the accelerometer bias at the first fix."""
-    velocity_sigma: Positive = 0.5
-    """m/s: prior of the velocity at the first fix."""
+    velocity_sigma: Positive = 2.0
+    """m/s: prior of the velocity at the first fix. Wide: with 0.5 a start at 3 m/s is refused fix after fix, and the
+    second fix makes the prior matter no more."""
     time_offset_sigma: NotNegative = 0.0
     """s: prior of the camera's time offset, to be added to a fix's stamp; 0 holds it at 0."""
     tilt_sigma: NotNegative = 0.0
@@ -62,10 +63,11 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     hypothesis_margin: NotNegative = 4.0
     """score by which one pose of a flat marker must beat the other to be believed with its tilt."""
 
-    reinit_gate: Positive = 16.81
-    """chi-square .99 at 6 degrees of freedom: rejected fixes agree when their d2 through the IMU is below."""
     reinit_count: Annotated[int, Meta(ge=2)] = 3
-    """that many rejects in a row that agree set the pose anew, if their attitude also agrees with the gyro."""
+    """that many rejects in a row that agree with each other through the IMU set the pose anew, if their attitude also
+    agrees with the gyro since the last accepted fix."""
+    reinit_angle: Positive = 0.35
+    """rad: twice as many do if it disagrees by less than this: then the noise is set too small, not the map wrong."""
     reinit_patience: Positive = 15.0
     """s: after that long they do even if it does not. Longer than a wrong map entry is in view (8-10 s measured)."""
 

@@ -68,7 +68,8 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         turn = (gyro - self.gyro_bias) * dt
         added = exp_so3(0.5 * turn) @ (accel - self.accel_bias) * dt  # Δv, in start axes
         A = exp_so3(-turn)
-        C = -GRAVITY * dt * self.rotation.T[:, :2]
+        du = np.vstack([np.eye(2), -self.tilt / self.up[2]])  # of the vertical, by the tilt
+        C = -GRAVITY * dt * self.rotation.T @ du
         F = np.eye(N)
         F[TH, DBG] = -dt * _I3
         F[DV, TH] = -skew(added)
@@ -124,6 +125,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         """Pose and its covariance from a fix; biases, time offset and tilt stay, uncorrelated with it."""
         self.rotation = rotation_from_quaternion(hypothesis[k.H_QUAT : k.H_QUAT + 4])
         self.position = hypothesis[k.H_POS : k.H_POS + 3].copy()
+        self.velocity = np.zeros(3)
         P = self.P.copy()
         P[:9, :] = 0.0
         P[:, :9] = 0.0
@@ -166,7 +168,7 @@ class _State:
         self.main = ErrorStateFilter()
         self.shadow: ErrorStateFilter | None = None
         self.shadow_count = 0
-        self.shadow_since = 0.0
+        self.rejected_since = 0.0
         self.t = self.t_imu = self.t_accepted = -math.inf
         self.u = np.zeros(6)
         self.next_t = math.inf
@@ -234,7 +236,7 @@ class ReferenceTimeline:
             self._advance(self._state, math.inf, live=True)
             if track is not None:
                 track[i] = np.nan
-                track[i, 0] = row[0]
+                track[i, 0] = self._state.t
                 if self._state.initialised:
                     track[i, 1:4] = self._state.main.position
                     track[i, 4:8] = quaternion_from_rotation(self._state.main.rotation)
@@ -287,8 +289,8 @@ class ReferenceTimeline:
             state.next_t, state.next_u = math.inf, state.u
             fresh = min(t, state.t_imu + self._params.imu_gap)
             for bridging, leg in ((False, fresh), (True, t)):
-                state.bridging = bridging
                 if leg > state.t:
+                    state.bridging = bridging
                     self._run_to(state, leg, fixes)
         if not state.initialised:
             return None
@@ -435,8 +437,7 @@ class ReferenceTimeline:
             if lead < p.hypothesis_margin:
                 for i in (3, 4):
                     hypothesis[k.H_COV + 7 * i] += k.UNKNOWN_TILT_SIGMA**2
-        priors = [0.0] * 9 + [p.gyro_bias_sigma] * 3 + [p.accel_bias_sigma] * 3 + [p.time_offset_sigma]
-        f.P = np.diag([sigma**2 for sigma in (*priors, p.tilt_sigma, p.tilt_sigma)])
+        f.P = self._prior()
         f.start(hypothesis, p.velocity_sigma)
         state.initialised = True
         state.accepted_count = 1
@@ -447,7 +448,14 @@ class ReferenceTimeline:
             H[:, TH] = skew(force)
             H[:, DBA] = _I3
             H[:, DTILT] = GRAVITY * f.rotation.T[:, :2]
-            f.correct(H, state.accel_mean - force, k.GRAVITY_SIGMA**2 * _I3)
+            y, R = state.accel_mean - force, k.GRAVITY_SIGMA**2 * _I3
+            if _d2(H @ f.P @ H.T + R, y) <= p.gate_block:
+                f.correct(H, y, R)
+
+    def _prior(self) -> Array:
+        p = self._params
+        sigmas = [0.0] * 9 + [p.gyro_bias_sigma] * 3 + [p.accel_bias_sigma] * 3 + [p.time_offset_sigma]
+        return np.diag(np.square([*sigmas, p.tilt_sigma, p.tilt_sigma]))
 
     def _weigh(self, state: _State, f: ErrorStateFilter, fix: Array) -> tuple[Array, Array, Array, Array]:
         """Choose the hypothesis, write the fix's figures. -> H, y, R, S."""
@@ -477,7 +485,7 @@ class ReferenceTimeline:
         p = self._params
         main = state.main
         H, y, R, S = self._weigh(state, main, fix)
-        ratio = max(fix[k.F_D2] / p.gate, fix[k.F_D2_POSITION] / p.gate_block, fix[k.F_D2_ATTITUDE] / p.gate_block)
+        ratio = self._gate_ratio(fix)
         if ratio <= p.gate_inflation:
             fix[k.F_OUTCOME] = k.ACCEPTED
             if ratio > 1.0:
@@ -490,32 +498,49 @@ class ReferenceTimeline:
             return
         fix[k.F_OUTCOME] = k.REJECTED
         figures = fix[k.F_D2 : k.F_REPORTED].copy()
+        if state.shadow is None:
+            state.rejected_since = state.t
+        patient = state.t - state.rejected_since >= p.reinit_patience
+        known = state.accepted_count >= p.reinit_count
+        agrees = False
         if state.shadow is not None:
-            H, y, R, _ = self._weigh(state, state.shadow, fix)
-            agrees = fix[k.F_D2] <= p.reinit_gate
+            H, y, R, S = self._weigh(state, state.shadow, fix)
+            ratio = self._gate_ratio(fix)
+            agrees = ratio <= p.gate_inflation
+            R = R + max(ratio - 1.0, 0.0) * S
             fix[k.F_D2 : k.F_REPORTED] = figures
-            if agrees:
-                state.shadow.correct(H, y, R)
-                state.shadow_count += 1
-                if state.shadow_count >= p.reinit_count and (
-                    state.accepted_count < p.reinit_count
-                    or state.t - state.shadow_since >= p.reinit_patience
-                    or self._attitudes_agree(main, state.shadow)
-                ):
-                    state.main, state.shadow, state.shadow_count = state.shadow, None, 0
-                    state.accepted_count = p.reinit_count
-                    state.reset_id += 1
-                    state.t_accepted = state.t
-                    fix[k.F_OUTCOME] = k.REINIT
-                return
-        shadow = copy.copy(main)
-        shadow.start(self._hypothesis(fix, int(fix[k.F_CHOSEN])), p.velocity_sigma)
-        shadow.velocity = shadow.rotation @ main.rotation.T @ main.velocity
-        state.shadow, state.shadow_count, state.shadow_since = shadow, 1, state.t
+        if state.shadow is not None and agrees:
+            state.shadow.correct(H, y, R)
+            state.shadow_count += 1
+            take = state.shadow_count >= p.reinit_count and (
+                patient or not known or self._attitudes_agree(state, main, state.shadow)
+            )
+        else:
+            state.shadow = copy.copy(main)
+            if not known:
+                state.shadow = ErrorStateFilter()
+                state.shadow.P = self._prior()
+            state.shadow.start(self._hypothesis(fix, int(fix[k.F_CHOSEN])), p.velocity_sigma)
+            state.shadow_count = 1
+            take = patient
+        if take:
+            state.main, state.shadow = state.shadow, None
+            state.accepted_count, state.shadow_count = state.shadow_count, 0
+            state.reset_id += 1
+            state.t_accepted = state.t
+            fix[k.F_OUTCOME] = k.REINIT
 
-    def _attitudes_agree(self, main: ErrorStateFilter, shadow: ErrorStateFilter) -> bool:
+    def _gate_ratio(self, fix: Array) -> float:
+        p = self._params
+        blocks = max(fix[k.F_D2_POSITION], fix[k.F_D2_ATTITUDE]) / p.gate_block
+        return float(max(fix[k.F_D2] / p.gate, blocks))
+
+    def _attitudes_agree(self, state: _State, main: ErrorStateFilter, shadow: ErrorStateFilter) -> bool:
+        p = self._params
         y = log_so3(main.rotation.T @ shadow.rotation)
-        return _d2(main.P[TH, TH] + shadow.P[TH, TH], y) <= self._params.gate_block
+        if _d2(main.P[TH, TH] + shadow.P[TH, TH], y) <= p.gate_block:
+            return True
+        return state.shadow_count >= 2 * p.reinit_count and float(np.linalg.norm(y)) <= p.reinit_angle
 
     def _constrain(self, f: ErrorStateFilter) -> None:
         p = self._params

@@ -57,8 +57,8 @@ class Timeline:
     def feed_samples(self, samples: Array, track: Array | None = None) -> int:
         """IMU samples (n, 7): t, gyro, accel. -> how many were neither duplicates nor older than the buffer.
 
-        `track` (n, 8) receives the pose after each sample, at its stamp: t, position, quaternion wxyz; NaN before
-        the first fix.
+        `track` (n, 8) receives the newest pose after each sample: its instant (the sample's stamp, unless that came
+        late), position, quaternion wxyz; NaN before the first fix.
         """
         outputs = self._nothing if track is None else track
         return int(k.process(self._memory, k.FEED_SAMPLES, 0.0, samples, outputs))

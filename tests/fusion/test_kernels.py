@@ -1,0 +1,210 @@
+"""The kernels by themselves: Jacobians against central differences, and what an update must leave true."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusion import kernels as k
+from fusion.geometry import exp_so3, log_so3, quaternion_from_rotation, rotation_from_quaternion
+from fusion.params import FilterParams
+from fusion.timeline import parameter_vector
+
+INPUT = np.array([0.7, -0.4, 1.1, 0.8, -1.2, 9.4])
+ERROR = [(k.TH, 3), (k.DV, 3), (k.DP, 3), (k.DBG, 3), (k.DBA, 3), (k.DTD, 1), (k.DTILT, 2)]
+
+
+def some_state(rng):
+    s = np.zeros(k.STATE)
+    s[k.Q : k.Q + 4] = quaternion_from_rotation(exp_so3(rng.normal(0.0, 0.8, 3)))
+    s[k.V : k.V + 3] = rng.normal(0.0, 1.0, 3)
+    s[k.POS : k.POS + 3] = rng.normal(0.0, 2.0, 3)
+    s[k.BG : k.BG + 3] = rng.normal(0.0, 0.02, 3)
+    s[k.BA : k.BA + 3] = rng.normal(0.0, 0.2, 3)
+    s[k.TD] = 0.01
+    s[k.TILT : k.TILT + 2] = rng.normal(0.0, 0.02, 2)
+    return s
+
+
+def some_covariance(rng):
+    A = rng.normal(0.0, 0.1, (k.N, k.N))
+    return A @ A.T + 1e-4 * np.eye(k.N)
+
+
+def moved(s, dx):
+    """The state whose error from s is dx, from the definition of the error."""
+    out = s.copy()
+    R = rotation_from_quaternion(s[k.Q : k.Q + 4])
+    out[k.Q : k.Q + 4] = quaternion_from_rotation(R @ exp_so3(dx[k.TH : k.TH + 3]))
+    out[k.V : k.V + 3] += R @ dx[k.DV : k.DV + 3]
+    out[k.POS : k.POS + 3] += R @ dx[k.DP : k.DP + 3]
+    out[k.BG : k.BG + 9] += dx[k.DBG :]
+    return out
+
+
+def error(s, other):
+    """The error (18,) that leads from s to other."""
+    R = rotation_from_quaternion(s[k.Q : k.Q + 4])
+    return np.concatenate(
+        [
+            log_so3(R.T @ rotation_from_quaternion(other[k.Q : k.Q + 4])),
+            R.T @ (other[k.V : k.V + 3] - s[k.V : k.V + 3]),
+            R.T @ (other[k.POS : k.POS + 3] - s[k.POS : k.POS + 3]),
+            other[k.BG : k.BG + 9] - s[k.BG : k.BG + 9],
+        ]
+    )
+
+
+def predict(s, dt, noise=(0.0, 0.0, 0.0, 0.0)):
+    out = s.copy()
+    k.predict(out, 0, *INPUT, dt, *noise)
+    return out
+
+
+def transition_by_differences(s, dt, h=1e-5):
+    F = np.empty((k.N, k.N))
+    for i in range(k.N):
+        dx = np.zeros(k.N)
+        dx[i] = h
+        F[:, i] = error(predict(moved(s, -dx), dt), predict(moved(s, dx), dt)) / (2.0 * h)
+    return F
+
+
+def transition_of_the_kernel(s, dt):
+    """F from P: with Q = 0, P = e eᵀ becomes (F e)(F e)ᵀ, and P = (e + f)(e + f)ᵀ gives the signs."""
+    F = np.empty((k.N, k.N))
+    probe = s.copy()
+    probe[k.COV : k.COV + k.N * k.N] = np.eye(k.N).ravel()
+    FFt = predict(probe, dt)[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
+    for i in range(k.N):
+        probe[k.COV : k.COV + k.N * k.N] = np.outer(np.eye(k.N)[i], np.eye(k.N)[i]).ravel()
+        P = predict(probe, dt)[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
+        # the column's own entry is positive: F is near the identity
+        F[:, i] = P[:, i] / np.sqrt(P[i, i])
+    np.testing.assert_allclose(F @ F.T, FFt, atol=1e-12)
+    return F
+
+
+def test_transition_equals_central_differences_to_second_order():
+    s = some_state(np.random.default_rng(1))
+    remainders = [
+        np.abs(transition_of_the_kernel(s, dt) - transition_by_differences(s, dt)).max() for dt in (0.02, 0.01, 0.005)
+    ]
+    # O(dt²): a halved step quarters what is left out; and that is small where the filter works
+    assert remainders[0] / remainders[1] == pytest.approx(4.0, rel=0.1)
+    assert remainders[1] / remainders[2] == pytest.approx(4.0, rel=0.1)
+    assert remainders[2] < 2e-4
+
+
+def test_process_noise_is_that_of_integrated_white_noise():
+    s = some_state(np.random.default_rng(2))
+    gyro, accel, gyro_walk, accel_walk = 1e-2, 3e-2, 1e-3, 4e-3
+    dt, n = 0.001, 1000
+    for _ in range(n):
+        s = predict(s, dt, (gyro, accel, gyro_walk, accel_walk))
+    P = s[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
+    # after one second: attitude σ²T + walk² T³/3; position σ²T³/3 and more by attitude
+    np.testing.assert_allclose(np.diag(P)[:3], gyro**2 + gyro_walk**2 / 3.0, rtol=2e-2)
+    np.testing.assert_allclose(np.diag(P)[k.DBG : k.DBG + 3], gyro_walk**2, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(P)[k.DBA : k.DBA + 3], accel_walk**2, rtol=1e-9)
+    assert np.trace(P[k.DP : k.DP + 3, k.DP : k.DP + 3]) > accel**2  # 3 axes × 1/3
+
+
+def fix_model(s, z):
+    """H, y of a fix through the kernel that weighs it."""
+    row = np.zeros(k.FIX)
+    row[k.F_COUNT] = 1.0
+    row[k.F_HYPOTHESES : k.F_HYPOTHESES + 7] = z
+    row[k.F_HYPOTHESES + k.H_COV : k.F_HYPOTHESES + k.H_COV + 36] = np.eye(6).ravel()
+    H, y, R, S = np.zeros((6, k.N)), np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
+    k._weigh(s, 0, parameter_vector(FilterParams(), "free"), row, H, y, R, S)
+    P = s[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
+    np.testing.assert_allclose(S, H @ P @ H.T + R, rtol=1e-12, atol=1e-12)
+    return H, y
+
+
+def test_fix_jacobian_equals_central_differences():
+    rng = np.random.default_rng(3)
+    s = some_state(rng)
+    s[k.U : k.U + 6] = INPUT
+    s[k.COV : k.COV + k.N * k.N] = some_covariance(rng).ravel()
+    z = np.concatenate([s[k.POS : k.POS + 3], s[k.Q : k.Q + 4]])  # the innovation is zero here
+    H, y = fix_model(s, z)
+    np.testing.assert_allclose(y, 0.0, atol=1e-12)
+    h = 1e-6
+    for i in range(k.DTD):
+        dx = np.zeros(k.N)
+        dx[i] = h
+        # y = z - h(x), so that H is minus its slope
+        slope = (fix_model(moved(s, dx), z)[1] - fix_model(moved(s, -dx), z)[1]) / (2.0 * h)
+        np.testing.assert_allclose(H[:, i], -slope, atol=1e-7)
+    # the time offset acts through the motion: where the body is h later
+    later, sooner = s.copy(), s.copy()
+    R = rotation_from_quaternion(s[k.Q : k.Q + 4])
+    rate = INPUT[:3] - s[k.BG : k.BG + 3]
+    for state, dt in ((later, h), (sooner, -h)):
+        state[k.POS : k.POS + 3] += s[k.V : k.V + 3] * dt
+        state[k.Q : k.Q + 4] = quaternion_from_rotation(R @ exp_so3(rate * dt))
+    slope = (fix_model(later, z)[1] - fix_model(sooner, z)[1]) / (2.0 * h)
+    np.testing.assert_allclose(H[:, k.DTD], -slope, atol=1e-7)
+
+
+@pytest.mark.parametrize("motion", ["ground", "differential"])
+def test_constraint_jacobian_equals_central_differences(motion):
+    """One constraint at a time, by how far each direction of error is pulled: K ∝ P Hᵀ."""
+    rng = np.random.default_rng(4)
+    s = some_state(rng)
+    prm = parameter_vector(FilterParams(), motion)
+
+    def prediction(state):
+        R = rotation_from_quaternion(state[k.Q : k.Q + 4])
+        body = R.T @ state[k.V : k.V + 3]
+        values = [state[k.V + 2], *R.T[:2, 2]]
+        return np.array([*values, body[1]] if motion == "differential" else values)
+
+    h = 1e-6
+    m = len(prediction(s))
+    H = np.empty((m, k.N))
+    for i in range(k.N):
+        dx = np.zeros(k.N)
+        dx[i] = h
+        H[:, i] = (prediction(moved(s, dx)) - prediction(moved(s, -dx))) / (2.0 * h)
+    P = some_covariance(rng)
+    sigmas = [prm[k.GROUND_VELOCITY_SIGMA], *[prm[k.GROUND_TILT_SIGMA]] * 2, prm[k.WHEEL_VELOCITY_SIGMA]][:m]
+    S = H @ P @ H.T + np.diag(np.square(sigmas))
+    expected = moved(s, P @ H.T @ np.linalg.solve(S, -prediction(s)))
+    s[k.COV : k.COV + k.N * k.N] = P.ravel()
+    k._constrain(s, prm)
+    np.testing.assert_allclose(s[: k.COV - 1], expected[: k.COV - 1], atol=1e-6)
+
+
+def test_update_is_the_textbook_one_and_keeps_a_covariance():
+    rng = np.random.default_rng(5)
+    s = some_state(rng)
+    P = some_covariance(rng)
+    s[k.COV : k.COV + k.N * k.N] = P.ravel()
+    H, y = rng.normal(0.0, 1.0, (4, k.N)), rng.normal(0.0, 0.05, 4)
+    R = np.diag([0.1, 0.2, 0.3, 0.4])
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    dx = K @ y
+    before = s.copy()
+    assert k.update(s, 0, H, y, R)
+    np.testing.assert_allclose(error(before, s), dx, atol=1e-12)
+    # the error about the new state, by differences of its definition
+    J = np.empty((k.N, k.N))
+    h = 1e-6
+    for i in range(k.N):
+        e = np.zeros(k.N)
+        e[i] = h
+        J[:, i] = (error(s, moved(before, dx + e)) - error(s, moved(before, dx - e))) / (2.0 * h)
+    after = s[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
+    np.testing.assert_allclose(after, J @ (P - K @ H @ P) @ J.T, atol=1e-8)
+    np.testing.assert_array_equal(after, after.T)
+    assert np.linalg.eigvalsh(after)[0] > 0.0
+
+
+def test_update_refuses_what_is_no_covariance():
+    s = some_state(np.random.default_rng(6))
+    before = s.copy()
+    assert not k.update(s, 0, np.eye(6, k.N), np.ones(6), -np.eye(6))
+    np.testing.assert_array_equal(s, before)

@@ -1,0 +1,164 @@
+"""The state is a function of the set of inputs: order of arrival, batches and repetitions do not matter."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from fusion import kernels as k
+from fusion.localiser import Localiser
+from fusion.measurements import ImuBatch, Outcome
+from fusion.params import FilterParams
+from tests.fusion import circle
+
+PARAMS = FilterParams(time_offset_sigma=0.05, tilt_sigma=0.03)
+AUX = [i for i in range(k.AUX, k.STATE) if not k.NEXT_T <= i <= k.BRIDGING]
+
+
+def final_state(measurements, motion="ground"):
+    localiser = Localiser("rover", PARAMS, motion)
+    for measurement in measurements:
+        localiser.feed(measurement)
+    state = localiser._timeline.state
+    end = k.AUX if state[k.SHADOW_COUNT] else k.SHADOW
+    return np.concatenate([state[:end], state[AUX]]), localiser
+
+
+def second(seed, offset_from=99):
+    """Inputs of 1.5 s: single IMU samples and fixes, one of them an outlier."""
+    rng = np.random.default_rng(seed)
+    samples = circle.imu(np.arange(0.0, 1.5, 0.02), rng)
+    batches = [ImuBatch("rover", 0.0, row[np.newaxis]) for row in samples]
+    fixes = [
+        circle.fix(at, rng=rng, offset=np.array([0.5, 0.0, 0.0]) if i in (3, offset_from) else None)
+        for i, at in enumerate(np.arange(0.05, 1.45, 0.1))
+    ]
+    return [*batches, *fixes], rng
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("motion", ["free", "ground", "differential"])
+def test_any_order_of_arrival_gives_the_same_bits(seed, motion):
+    measurements, rng = second(seed)
+    expected, localiser = final_state(measurements, motion)
+    assert localiser.counts["rejected"] == 1
+    for _ in range(5):
+        order = rng.permutation(len(measurements))
+        state, _ = final_state([measurements[i] for i in order], motion)
+        np.testing.assert_array_equal(state, expected)
+
+
+def test_every_order_of_a_handful():
+    """All 720 orders of three fixes and three batches, with a fix before all IMU data and one after them."""
+    t = np.arange(0.1, 0.7, 0.02)
+    batches = [circle.batch(part) for part in np.split(t, 3)]
+    measurements = [*batches, circle.fix(0.05), circle.fix(0.31), circle.fix(0.683)]
+    states = [final_state(order)[0] for order in itertools.permutations(measurements)]
+    for state in states[1:]:
+        np.testing.assert_array_equal(state, states[0])
+
+
+def test_batches_are_only_packaging():
+    rng = np.random.default_rng(7)
+    samples = circle.imu(np.arange(0.0, 3.0, 0.005), rng)
+    fixes = [circle.fix(at, rng=rng) for at in (0.1, 0.6, 1.1, 1.6, 2.1, 2.6)]
+    states = []
+    for size in (1, 7, 600):
+        localiser = Localiser("rover", PARAMS)
+        waiting = list(fixes)
+        for i in range(0, len(samples), size):
+            chunk = samples[i : i + size]
+            localiser.feed(ImuBatch("rover", 0.0, chunk))
+        for fix in waiting:
+            localiser.feed(fix)
+        states.append(localiser._timeline.state[: k.SHADOW].copy())
+        assert (
+            localiser.counts["accepted"] + localiser.counts["too_late"] == len(fixes) - localiser.counts["initialised"]
+        )
+    np.testing.assert_array_equal(states[0], states[1])
+    np.testing.assert_array_equal(states[0], states[2])
+
+
+def test_a_stamp_seen_twice_counts_once_whichever_comes_first():
+    samples = circle.imu(np.arange(0.0, 1.0, 0.02), np.random.default_rng(8))
+    other = samples[20].copy()
+    other[1:] += 0.3
+    first = [ImuBatch("rover", 0.0, samples), ImuBatch("rover", 0.0, other[np.newaxis]), circle.fix(0.2)]
+    late = np.vstack([samples[:20], other, samples[21:]])
+    second = [circle.fix(0.2), ImuBatch("rover", 0.0, late), ImuBatch("rover", 0.0, samples)]
+    a, localiser = final_state(first)
+    b, _ = final_state(second)
+    np.testing.assert_array_equal(a, b)
+    assert localiser.counts["imu_duplicates"] == 1
+    assert localiser.counts["imu_samples"] == 51
+
+
+def test_too_late_is_counted_and_said_and_changes_nothing():
+    measurements = [circle.batch(np.arange(0.0, 5.0, 0.01)), circle.fix(4.0)]
+    expected, localiser = final_state(measurements)
+    outcome = localiser.feed(circle.fix(2.9))
+    assert [o.outcome for o in outcome] == [Outcome.TOO_LATE]
+    localiser.feed(circle.batch(np.array([2.905])))
+    assert localiser.counts["too_late"] == 1
+    assert localiser.counts["imu_late"] == 1
+    np.testing.assert_array_equal(localiser._timeline.state[: k.SHADOW], expected[: k.SHADOW])
+
+
+def test_the_same_fix_twice():
+    _, localiser = final_state([circle.batch(np.arange(0.0, 1.0, 0.01)), circle.fix(0.5)])
+    assert [o.outcome for o in localiser.feed(circle.fix(0.5, delay=0.3))] == [Outcome.DUPLICATE]
+
+
+def test_a_fix_ahead_of_the_imu_waits_for_it():
+    localiser = Localiser("rover", PARAMS)
+    localiser.feed(circle.batch(np.arange(0.0, 1.0, 0.01)))
+    localiser.feed(circle.fix(0.5))
+    assert localiser.feed(circle.fix(1.05)) == []
+    outcomes = localiser.feed(circle.batch(np.arange(1.0, 1.2, 0.01)))
+    assert [(o.t, o.outcome, o.source) for o in outcomes] == [(1.05, Outcome.ACCEPTED, "ceiling")]
+
+
+def test_without_imu_fixes_alone_still_make_a_pose():
+    localiser = Localiser("rover", PARAMS)
+    for at in np.arange(0.0, 8.0, 0.25):
+        outcomes = localiser.feed(circle.fix(at))
+        assert [o.outcome for o in outcomes if o.outcome is Outcome.REJECTED] == []
+    pose = localiser.pose_at(7.8)
+    assert pose.mode == "NO_IMU"
+    assert np.linalg.norm(pose.position - circle.pose(7.8)[0]) < 0.1
+
+
+@pytest.mark.parametrize("capacity", ["IMU_CAPACITY", "FIX_CAPACITY"])
+def test_full_rings_forget_the_oldest_and_go_on(capacity):
+    localiser = Localiser("rover", FilterParams(), "ground")
+    step = {"IMU_CAPACITY": 1e-4, "FIX_CAPACITY": 0.01}[capacity]
+    t = np.arange(0.0, 3.0 * getattr(k, capacity) * step, step)
+    for part in np.array_split(t, 60):
+        localiser.feed(circle.batch(part))
+        for at in part[:: 1 if capacity == "FIX_CAPACITY" else len(part)]:
+            localiser.feed(circle.fix(at))
+    assert localiser.counts["rejected"] == 0
+    assert localiser.counts["too_late"] == 0
+    assert np.linalg.norm(localiser.latest.position - circle.pose(t[-1])[0]) < 0.01
+
+
+def test_pose_at_agrees_with_the_track_and_leaves_no_trace():
+    rng = np.random.default_rng(9)
+    samples = circle.imu(np.arange(0.0, 3.0, 0.005), rng)
+    localiser = Localiser("rover", PARAMS)
+    track = np.empty((len(samples), 8))
+    for i, at in zip(range(0, 600, 100), (0.1, 0.6, 1.1, 1.6, 2.1, None), strict=True):
+        localiser.feed(ImuBatch("rover", 0.0, samples[i : i + 100]), track[i : i + 100])
+        if at is not None:
+            localiser.feed(circle.fix(at, rng=rng))
+    before = localiser._timeline._memory.copy()
+    for i in (500, 533, 599):  # on samples, after the last fix that had arrived before them, of 2.1 s
+        pose = localiser.pose_at(samples[i, 0])
+        np.testing.assert_array_equal(pose.position, track[i, 1:4])
+        np.testing.assert_array_equal(pose.quaternion_wxyz, track[i, 4:])
+    between = localiser.pose_at(1.6525)
+    assert np.linalg.norm(between.position - circle.pose(1.6525)[0]) < 0.03
+    np.testing.assert_array_equal(localiser._timeline._memory, before)
+    assert localiser.pose_at(0.05) is None
