@@ -137,7 +137,8 @@ class View:
         return residual.ravel(), jacobian.reshape(-1, 6)
 
     def refine(self, world_from_body: Array, columns: Sequence[int] = range(6)) -> tuple[Array, Array, float] | None:
-        """Least squares over the named columns of (position, rotation) by Levenberg and Marquardt.
+        """Least squares over the named columns of (position, rotation), none of which is possible, by Levenberg and
+        Marquardt.
 
         Returns the pose (4, 4), the Jacobian (2n, 6) there and the misfit; None where it starts behind the camera or
         where a column cannot be told from the corners.
@@ -147,6 +148,8 @@ class View:
             return None
         residual, jacobian = at
         misfit = float(residual @ residual)
+        if not len(columns):
+            return world_from_body, jacobian, misfit
         damping = 1e-6
         for _ in range(50):
             J = jacobian[:, columns]
@@ -178,10 +181,11 @@ class View:
 def marker_poses(
     corners_px: Array, size: float, intrinsics: Intrinsics, sigma_px: float = 1.0
 ) -> tuple[MarkerPose, ...]:
-    """The poses that one marker can have: two, the likelier first; one where both refine to the same; none if absurd.
+    """The two poses that one marker can have, the likelier first; none if the corners are no marker's.
 
     `corners_px` (4, 2), `size` in m. A flat square seen with little perspective looks the same tilted the other way:
-    both solutions come from OpenCV's IPPE (Collins and Bartoli, 2014) and are refined on the corner pixels.
+    both solutions come from OpenCV's IPPE (Collins and Bartoli, 2014) and are refined on the corner pixels. Where
+    perspective rules the second out, refining it leads to the first: it is then left as IPPE has it, with its misfit.
     """
     corners = np.ascontiguousarray(corners_px, dtype=np.float64)
     points = marker_corners(size)
@@ -192,20 +196,19 @@ def marker_poses(
         )
     except cv2.error:
         return ()
+    starts = [transform(exp_so3(r.ravel()), t.ravel()) for r, t in zip(rotations, translations, strict=True)]
     found: list[MarkerPose] = []
-    for rotation, translation in zip(rotations, translations, strict=True):
-        start = transform(exp_so3(rotation.ravel()), translation.ravel())
+    for start in starts:
         refined = view.refine(start) if np.isfinite(start).all() else None
+        if refined is not None and any(_same(refined[0], other.camera_from_marker) for other in found):
+            refined = view.refine(start, ())
         if refined is None:
             continue
         camera_from_marker, jacobian, misfit = refined
-        # The paper's face must look at the camera: the other solutions are of a marker seen from behind.
-        if camera_from_marker[:3, 2] @ camera_from_marker[:3, 3] >= 0.0:
-            continue
         covariance = _covariance(jacobian)
-        if covariance is None or any(_same(camera_from_marker, other.camera_from_marker) for other in found):
-            continue
-        found.append(MarkerPose(camera_from_marker, covariance, misfit, sigma_px * math.sqrt(misfit / 4.0)))
+        # The paper's face must look at the camera.
+        if covariance is not None and camera_from_marker[:3, 2] @ camera_from_marker[:3, 3] < 0.0:
+            found.append(MarkerPose(camera_from_marker, covariance, misfit, sigma_px * math.sqrt(misfit / 4.0)))
     return tuple(sorted(found, key=lambda pose: pose.misfit))
 
 

@@ -1,0 +1,311 @@
+"""Where frames come from: USB and V4L2 cameras, network cameras, video files, folders of images.
+
+A camera is read by a thread of its own that keeps the newest frame only: a reader that is slow skips frames instead of
+falling behind. Files are read in order, at their own pace, without skipping.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+# FFmpeg and OpenCV print warnings of their own; what matters of them is said by the errors of this module. FFmpeg's
+# level is only read when it starts.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+import cv2
+import numpy as np
+
+from camera.markers import Pixels
+
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"))
+# Frames per second of a folder of images where the configuration does not say.
+FOLDER_RATE_HZ = 10.0
+# A network camera that does not answer for so long is lost, s.
+NETWORK_TIMEOUT = 5.0
+
+_log = logging.getLogger(__name__)
+# Two threads that redirect standard error at once would leave it redirected.
+_stderr_lock = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture. `t`: s on the host's monotonic clock, mid-exposure as well as it is known. `image`: grey or BGR.
+
+    `sequence` counts what the source delivered, frames that were skipped included.
+    """
+
+    t: float
+    image: Pixels
+    sequence: int
+
+
+class FrameSource(Protocol):
+    """What `open_source` returns."""
+
+    def read(self, timeout: float) -> Frame | None:
+        """The next frame (of a camera: the newest that was not read yet); None at the end of a file or folder.
+
+        Raises OSError when the camera is lost; TimeoutError, which is one, when it delivers nothing for `timeout` s.
+        """
+
+    def close(self) -> None:
+        """Lets go of the device and ends its thread. A `read` that is waiting returns."""
+
+
+class Device(Protocol):
+    """A camera that blocks until it has a frame."""
+
+    def grab(self) -> tuple[float, Pixels]:
+        """Mid-exposure (s, host monotonic) and picture. Raises OSError when the camera is lost."""
+
+    def close(self) -> None: ...
+
+
+class LiveSource:
+    """Newest frame of a device, read by a thread of its own, which also closes it."""
+
+    def __init__(self, name: str, device: Device) -> None:
+        self._name = name
+        self._device = device
+        self._changed = threading.Condition()
+        self._frame: Frame | None = None
+        self._read = 0
+        self._error: OSError | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
+        self._thread.start()
+
+    def read(self, timeout: float) -> Frame | None:
+        """See FrameSource. None after `close`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self._error or self._is_new(), timeout)
+            if self._closing:
+                return None
+            if self._frame is not None and self._is_new():
+                self._read = self._frame.sequence
+                return self._frame
+            if self._error is not None:
+                raise self._error
+        raise TimeoutError(f"camera {self._name}: no frame for {timeout:g} s")
+
+    def close(self) -> None:
+        """See FrameSource."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        # A camera that hangs may hold its thread for longer; it then ends by itself.
+        self._thread.join(2.0 * NETWORK_TIMEOUT)
+
+    def _is_new(self) -> bool:
+        return self._frame is not None and self._frame.sequence > self._read
+
+    def _run(self) -> None:
+        sequence = 0
+        try:
+            while not self._closing:
+                t, image = self._device.grab()
+                sequence += 1
+                with self._changed:
+                    self._frame = Frame(t, image, sequence)
+                    self._changed.notify_all()
+        except OSError as error:
+            with self._changed:
+                self._error = error
+                self._changed.notify_all()
+        finally:
+            self._device.close()
+
+
+class FileSource:
+    """Pictures in order. `images` yields them; frame k is stamped `start + k / rate_hz`.
+
+    `paced`: each is handed out when its time has come, as a camera would, and the clock waits for a slow reader, so
+    that stamps do not fall behind; otherwise at once.
+    """
+
+    def __init__(self, images: Iterator[Pixels], rate_hz: float, paced: bool) -> None:
+        self._images = images
+        self._interval = 1.0 / rate_hz
+        self._paced = paced
+        self._sequence = 0
+        self._start = 0.0
+        self._closed = threading.Event()
+
+    def read(self, timeout: float) -> Frame | None:
+        """See FrameSource; a file is never late, so that `timeout` means nothing here."""
+        if self._closed.is_set():
+            return None
+        image = next(self._images, None)
+        if image is None:
+            return None
+        if self._sequence == 0:
+            self._start = time.monotonic()
+        t = self._start + self._sequence * self._interval
+        if self._paced:
+            late = time.monotonic() - t
+            if late > self._interval:
+                self._start += late
+                t += late
+            elif self._closed.wait(max(0.0, -late)):
+                return None
+        self._sequence += 1
+        return Frame(t, image, self._sequence)
+
+    def close(self) -> None:
+        """See FrameSource."""
+        self._closed.set()
+
+
+def open_source(
+    source: str | int, *, width_px: int = 0, height_px: int = 0, frame_rate_hz: float = 0.0, paced: bool = True
+) -> FrameSource:
+    """Opens a camera or file.
+
+    `source`: a number or "/dev/videoN" (V4L2), "rtsp://...", "picamera", a video file or a folder of images, which are
+    taken in the order of their names. Size and frame rate are a wish that a camera may not grant; 0 leaves it to the
+    camera. A file runs at its own rate, a folder at FOLDER_RATE_HZ, unless `frame_rate_hz` says otherwise;
+    `paced=False` reads them as fast as possible. Raises OSError in plain words if it is not there.
+    """
+    if source == "picamera":
+        from camera.picamera import PiCamera  # libcamera only exists on a Raspberry Pi
+
+        return LiveSource("picamera", PiCamera(width_px, height_px, frame_rate_hz))
+    if isinstance(source, int) or source.isdecimal():
+        source = f"/dev/video{source}" if sys.platform.startswith("linux") else int(source)
+    if isinstance(source, int) or source.startswith("/dev/") or "://" in source:
+        return LiveSource(str(source), _VideoDevice(source, width_px, height_px, frame_rate_hz))
+    path = Path(source)
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+        if not files:
+            raise FileNotFoundError(f"{path}: no image in this folder ({', '.join(sorted(IMAGE_SUFFIXES))})")
+        return FileSource(_images(files), frame_rate_hz or FOLDER_RATE_HZ, paced)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such video file, folder of images or camera")
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    rate = frame_rate_hz or capture.get(cv2.CAP_PROP_FPS)
+    # A file that is no video may still open, as one frame of text, but it has no rate or no size.
+    if not capture.isOpened() or not rate > 0.0 or capture.get(cv2.CAP_PROP_FRAME_WIDTH) <= 0.0:
+        raise OSError(f"{path}: not a video file that can be read")
+    return FileSource(_frames(capture), rate, paced)
+
+
+def read_image(path: str | os.PathLike[str]) -> Pixels:
+    """An image file as (height, width) or (height, width, 3) BGR, 8 or 16 bits, turned upright by its EXIF tag.
+
+    Raises OSError if there is none or it cannot be decoded; the text begins with the path.
+    """
+    try:
+        content = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise OSError(f"{path}: {error.strerror or error}") from None
+    with _stderr_silenced():
+        try:
+            image = cv2.imdecode(content, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if content.size else None
+        except cv2.error:  # larger than OpenCV's limit
+            image = None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise OSError(f"{path}: not an image that can be read")
+    return np.asarray(image)
+
+
+class _VideoDevice:
+    """A camera through OpenCV: V4L2 on Linux, FFmpeg for network streams."""
+
+    def __init__(self, source: str | int, width_px: int, height_px: int, frame_rate_hz: float) -> None:
+        self._name = str(source)
+        if isinstance(source, str) and source.startswith("/dev/"):
+            _check_device(Path(source))
+        wanted = {
+            cv2.CAP_PROP_FRAME_WIDTH: width_px,
+            cv2.CAP_PROP_FRAME_HEIGHT: height_px,
+            cv2.CAP_PROP_FPS: frame_rate_hz,
+        }
+        with _stderr_silenced():
+            if "://" in self._name:
+                limit = int(1000.0 * NETWORK_TIMEOUT)
+                limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
+                self._capture = cv2.VideoCapture(self._name, cv2.CAP_FFMPEG, limits)
+            else:
+                self._capture = cv2.VideoCapture(source, cv2.CAP_ANY)
+                for key, value in wanted.items():
+                    if value:
+                        self._capture.set(key, value)
+                self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        if not self._capture.isOpened():
+            raise OSError(
+                f"camera {self._name}: no answer within {NETWORK_TIMEOUT:g} s; check address, user and password"
+                if "://" in self._name
+                else f"camera {self._name}: cannot be opened; is it in use by another program?"
+            )
+
+    def grab(self) -> tuple[float, Pixels]:
+        if not self._capture.grab():
+            raise OSError(f"camera {self._name}: lost; it no longer delivers frames")
+        now = time.monotonic()
+        # V4L2 reports the driver's own stamp here, on the monotonic clock; other backends the time in the stream.
+        driver = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+        ok, image = self._capture.retrieve()
+        if not ok:
+            raise OSError(f"camera {self._name}: lost; it delivers frames that cannot be decoded")
+        return driver if 0.0 <= now - driver < 1.0 else now, np.asarray(image)
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def _check_device(path: Path) -> None:
+    """Raises OSError with what OpenCV does not say: which cameras there are, or that permission is missing."""
+    if not path.exists():
+        there = ", ".join(str(device) for device in sorted(path.parent.glob("video*"))) or "none"
+        raise FileNotFoundError(f"camera {path}: not there; cameras found: {there}")
+    if not os.access(path, os.R_OK | os.W_OK):
+        raise PermissionError(f"camera {path}: no permission; add the user to the group `video`")
+
+
+def _images(files: list[Path]) -> Iterator[Pixels]:
+    for file in files:
+        try:
+            yield read_image(file)
+        except OSError as error:
+            # One bad file must not end the others.
+            _log.warning("%s; skipped", error)
+
+
+def _frames(capture: cv2.VideoCapture) -> Iterator[Pixels]:
+    try:
+        while (frame := capture.read())[0]:
+            yield np.asarray(frame[1])
+    finally:
+        capture.release()
+
+
+@contextlib.contextmanager
+def _stderr_silenced() -> Iterator[None]:
+    """Discards what libraries in C write to standard error: the decoders of images have no other switch.
+
+    It is the process's own standard error, so that another thread's words in these milliseconds are lost as well.
+    """
+    with _stderr_lock:
+        sys.stderr.flush()
+        kept = os.dup(2)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
