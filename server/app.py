@@ -14,6 +14,7 @@ import itertools
 import logging
 import math
 import socket
+import threading
 import time
 from collections.abc import Callable, Collection, Coroutine
 from contextlib import AbstractContextManager
@@ -212,15 +213,33 @@ class Service:
         task.add_done_callback(done)
 
     async def _warm_up(self) -> None:
-        engines = {robot.config.engine for robot in self.robots.values()}
-        begun = time.monotonic()
-        work = asyncio.gather(*(asyncio.to_thread(warm_up, engine) for engine in engines))
+        warm: asyncio.Future[None] = self._loop.create_future()
+
+        def end(error: Exception | None) -> None:
+            if error is not None:
+                warm.set_exception(error)
+            else:
+                warm.set_result(None)
+
+        def work() -> None:
+            try:
+                for engine in sorted({robot.config.engine for robot in self.robots.values()}):
+                    warm_up(engine)
+            except Exception as error:
+                self._call_from_thread(end, error)
+            else:
+                self._call_from_thread(end, None)
+
+        # A daemon, unlike the threads of asyncio: compiling must not keep the service from ending.
+        threading.Thread(target=work, name="warm-up", daemon=True).start()
         # Loading takes a moment, compiling a while: only that needs an explanation.
-        await asyncio.wait([work], timeout=3.0)
-        if not work.done():
-            log.info("compiling the filters; this happens once after each update and may take a minute")
-        await work
-        log.debug("the filters were ready after %.1f s", time.monotonic() - begun)
+        notice = self._loop.call_later(
+            3.0, log.info, "compiling the filters; this happens once after each update and may take a minute"
+        )
+        try:
+            await asyncio.shield(warm)
+        finally:
+            notice.cancel()
         self.ready.set()
 
     # Inputs

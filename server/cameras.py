@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from camera.capture import Frame, FrameSource, open_source
 
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
+from camera.capture import Frame, FrameSource, open_source
 from camera.fix import MarkerMount, marker_poses, rays, solve
 from camera.floor import Anchor, Placement, PlacementError, locate_camera
 from camera.markers import MarkerDetector, MarkerSighting
@@ -28,6 +28,8 @@ log = logging.getLogger("steadfix.camera")
 
 # s before a camera that is not there is tried again: the first pause, which doubles up to the longest.
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 30.0
+# s without a frame after which a camera counts as lost. The first frame of a USB camera takes a second or two.
+READ_TIMEOUT = 5.0
 # Frames whose anchor corners are averaged for one placement, and s between two such looks at the anchors.
 PLACEMENT_FRAMES = 10
 PLACEMENT_CHECK = 5.0
@@ -107,6 +109,7 @@ class Camera:
         self._settled = False
         self._moved = False
         self._arrivals: deque[float] = deque()
+        self._source: FrameSource | None = None
         self._stop = threading.Event()
         # A daemon: a driver that hangs must not keep the service from ending.
         self._thread = threading.Thread(target=self._run, name=f"camera {config.name}", daemon=True)
@@ -117,6 +120,9 @@ class Camera:
     def stop(self) -> None:
         """Ask the thread to end; `join` waits for it."""
         self._stop.set()
+        if (source := self._source) is not None:
+            # Wakes a read that waits for a frame. It may itself wait for a driver that hangs.
+            threading.Thread(target=source.close, daemon=True).start()
 
     def join(self, timeout: float) -> None:
         if self._thread.ident is not None:
@@ -145,10 +151,10 @@ class Camera:
 
     def _watch(self) -> bool:
         """Work until the source ends (True) or is lost (OSError)."""
-        source = self._open(self.config)
+        source = self._source = self._open(self.config)
         try:
             while not self._stop.is_set():
-                frame = source.read(timeout=0.5)
+                frame = source.read(READ_TIMEOUT)
                 if self._stop.is_set():
                     break
                 if frame is None:
@@ -160,6 +166,7 @@ class Camera:
                     self.status = ""
                 self._deliver(self._see(frame))
         finally:
+            self._source = None
             source.close()
         return True
 

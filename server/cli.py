@@ -23,9 +23,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit status of the command line `argv`; never raises for what a user or the machine did."""
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
-        args = _parser(argv).parse_args(argv)
-        status: int = args.run(args)
-        sys.stdout.flush()
+        try:
+            args = _parser(argv).parse_args(argv)
+            status: int = args.run(args)
+        finally:
+            # Here, where a closed pipe is understood, and not in the interpreter's last moments.
+            sys.stdout.flush()
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:

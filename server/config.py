@@ -161,7 +161,7 @@ def parse(text: str, name: str = "configuration", folder: Path = Path()) -> Conf
 
 def _with_absolute_paths(camera: CameraConfig, folder: Path) -> CameraConfig:
     source = camera.source
-    if isinstance(source, str) and source != "picamera" and "://" not in source:
+    if isinstance(source, str) and source != "picamera" and "://" not in source and not source.isdecimal():
         source = str((folder / source).absolute())
     calibration = str((folder / camera.calibration).absolute())
     return msgspec.structs.replace(camera, source=source, calibration=calibration)

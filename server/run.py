@@ -39,16 +39,15 @@ async def _run(args: argparse.Namespace) -> int:
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    room = DemoRoom() if args.config is None else None
+    if args.config is not None:
+        await _serve_until(stop, load(args.config), args)
+        return 0
+    room = DemoRoom()
     try:
-        if room is None:
-            await _serve_until(stop, load(args.config), args)
-        else:
-            await _serve_until(stop, room.config(), args, room)
+        await _serve_until(stop, room.config(), args, room)
     finally:
-        if room is not None:
-            room.stop()
-            print(room.report(), flush=True)
+        room.stop()
+    print(room.report(), flush=True)
     return 0
 
 
@@ -58,17 +57,21 @@ async def _serve_until(
     changes = {key: value for key in ("host", "port") if (value := getattr(args, key)) is not None}
     config = msgspec.structs.replace(config, server=msgspec.structs.replace(config.server, **changes))
     async with contextlib.AsyncExitStack() as stack:
-        recording = None
+        recorder = None
         if args.record is not None:
-            recording = stack.enter_context(contextlib.closing(Recorder(args.record, [r.name for r in config.robot])))
+            recorder = stack.enter_context(contextlib.closing(Recorder(args.record, [r.name for r in config.robot])))
         if room is None:
-            service = Service(config, recording)
+            service = Service(config, recorder)
         else:
-            service = Service(config, recording, room.open_camera, room.score)
+            # Nobody must write the truth to a recording that is closed.
+            stack.callback(room.stop)
+            room.record_truth = recorder.truth if recorder is not None else None
+            service = Service(config, recorder, room.open_camera, room.score)
         await stack.enter_async_context(service)
+        address = f"{_reachable(config.server.host)}:{service.port}"
         if room is not None:
-            room.start(f"ws://{_reachable(config.server.host)}:{service.port}")
-        print(f"{SERVICE}: http://{_reachable(config.server.host)}:{service.port}/", flush=True)
+            room.start(f"ws://{address}")
+        print(f"{SERVICE}: http://{address}/", flush=True)
         stopped = asyncio.create_task(stop.wait())
         await asyncio.wait((stopped, service.failed), return_when=asyncio.FIRST_COMPLETED)
         stopped.cancel()
