@@ -118,6 +118,10 @@ def _numbers(path: Path, names: list[str], wanted: Sequence[str]) -> Array:
     try:
         with _open(path) as file:
             file.readline()
+            body = file.tell()
+            if not file.read(100).strip():
+                return np.empty((0, len(wanted)))
+            file.seek(body)
             table = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2, comments=None)
         if np.isfinite(table).all():
             return table.reshape(-1, len(wanted))

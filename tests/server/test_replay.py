@@ -1,0 +1,251 @@
+"""Recordings on disk, and their replay."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from fusion.consistency import rms, track_error
+from fusion.localiser import Localiser
+from fusion.measurements import ImuBatch, PoseFix, PoseHypothesis
+from fusion.params import FilterParams
+from server.cli import main
+from server.recording import FIX_COLUMNS, Recorder, RecordingError, load, robot_folders
+from server.replay import replay
+from tests.data import data
+from tests.fusion import circle
+
+
+def inputs(seconds=6.0, seed=1):
+    """IMU batches and fixes of a robot on its circle, by arrival: batches of ten 10 ms late, fixes 100 to 300 ms."""
+    rng = np.random.default_rng(seed)
+    samples = circle.imu(np.arange(0.0, seconds, 0.01), rng)
+    arriving = []
+    for i in range(0, len(samples), 10):
+        arrival = samples[i + 9, 0] + 0.01
+        arriving.append((arrival, ImuBatch("rover", arrival, samples[i : i + 10])))
+    for i, t in enumerate(np.arange(0.2, seconds - 0.4, 0.5)):
+        arrival = t + rng.uniform(0.1, 0.3)
+        hypotheses = [circle.hypothesis(t, rng)]
+        if i % 2:
+            other = circle.hypothesis(t, rng, turned=0.3)
+            covariance = other.covariance + 1e-6 * np.arange(36).reshape(6, 6) * np.eye(6)
+            hypotheses.append(PoseHypothesis(other.position, other.quaternion_wxyz, covariance, 7.5))
+        arriving.append((arrival, PoseFix("rover", t, arrival, tuple(hypotheses), "ceiling")))
+    return [measurement for _, measurement in sorted(arriving, key=lambda pair: pair[0])]
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A recording made as the service makes it, and the track of that live run."""
+    localiser = Localiser("rover")
+    tracks = []
+    recorder = Recorder(tmp_path / "run", ["rover", "idle"])
+    for measurement in inputs():
+        if isinstance(measurement, ImuBatch):
+            track = np.empty((len(measurement.samples), 8))
+            localiser.feed(measurement, track)
+            tracks.append(track)
+            recorder.imu(measurement)
+            recorder.track("rover", track)
+        else:
+            localiser.feed(measurement)
+            recorder.fix(measurement)
+    for t in np.arange(0.0, 6.0, 0.05):
+        true = circle.hypothesis(t)
+        recorder.truth("rover", t, true.position, true.quaternion_wxyz)
+    recorder.close()
+    return tmp_path / "run" / "rover", np.concatenate(tracks)
+
+
+def plain(folder, imu=None, fixes=None):
+    """A recording in the plain format; lines may be given."""
+    folder.mkdir(exist_ok=True)
+    t = np.arange(0.0, 3.0, 0.01)
+    if imu is None:
+        imu = [",".join(map(str, row)) for row in circle.imu(t).tolist()]
+    if fixes is None:
+        fixes = []
+        for at in (0.2, 0.7, 1.2, 1.7, 2.2):
+            h = circle.hypothesis(at)
+            fixes.append(",".join(map(str, [at, at + 0.15, *h.position, *h.quaternion_wxyz])))
+    (folder / "imu.csv").write_text("\n".join(["t_s,gx,gy,gz,ax,ay,az", *imu]) + "\n")
+    (folder / "fixes.csv").write_text("\n".join(["t_s,arrival_s,x,y,z,qw,qx,qy,qz", *fixes]) + "\n")
+    return folder
+
+
+def test_a_replay_gives_the_live_poses_to_the_last_bit(recorded):
+    folder, live = recorded
+    track, outcomes, _ = replay(load(folder), Localiser("rover"))
+    np.testing.assert_array_equal(track, live)
+    published = np.loadtxt(folder / "poses.tum")
+    known = np.isfinite(live).all(axis=1)
+    np.testing.assert_array_equal(published, live[known][:, [0, 1, 2, 3, 5, 6, 7, 4]])
+    assert {outcome.source for outcome in outcomes} == {"ceiling"}
+    error = track_error(track, load(folder).truth)
+    assert rms(error.position[error.t > 2.0]) < 0.03  # by then the speed is known
+
+
+def test_what_is_recorded_is_what_was_fed(recorded):
+    folder, _ = recorded
+    recording = load(folder)
+    fed = [measurement for measurement in inputs() if isinstance(measurement, PoseFix)]
+    assert [fix.t for fix in recording.fixes] == [fix.t for fix in fed]
+    for a, b in zip(recording.fixes, fed, strict=True):
+        assert (a.arrival, a.source) == (b.arrival, b.source)
+        for x, y in zip(a.hypotheses, b.hypotheses, strict=True):
+            np.testing.assert_array_equal(x.position, y.position)
+            np.testing.assert_array_equal(x.covariance, y.covariance)
+            assert x.misfit == y.misfit
+
+
+def test_poses_are_causal(tmp_path):
+    """What comes later changes nothing of what was published: a recording cut short gives the same beginning."""
+    folder = plain(tmp_path / "whole")
+    whole, _, _ = replay(load(folder), Localiser("rover"))
+    cut = load(folder)
+    for n in (57, 143, 222):
+        end = cut.samples[n, 0]
+        part = cut._replace(
+            samples=cut.samples[: n + 1],
+            arrival=cut.arrival[: n + 1],
+            fixes=[fix for fix in cut.fixes if fix.arrival <= end],
+        )
+        track, _, _ = replay(part, Localiser("rover"))
+        np.testing.assert_array_equal(track, whole[: n + 1])
+
+
+def test_a_fix_counts_from_its_arrival_on(tmp_path):
+    track, _, _ = replay(load(plain(tmp_path / "r")), Localiser("rover"))
+    known = np.flatnonzero(np.isfinite(track[:, 1]))
+    assert track[known[0], 0] == pytest.approx(0.35)  # captured at 0.2, 0.15 s on the way
+
+
+@pytest.mark.parametrize("engine", ["numba", "filterpy"])
+def test_command_prints_one_object(tmp_path, capsys, engine):
+    folder = plain(tmp_path / "drive")
+    assert main(["replay", str(folder), "--json", "--engine", engine, "--motion", "differential"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["samples"] == 300
+    assert (figures["fixes_accepted"], figures["fixes_rejected"], figures["fixes_late"]) == (5, 0, 0)
+    assert (figures["motion"], figures["engine"]) == ("differential", engine)
+    assert figures["speed"] > 0
+    assert "rmse_mm" not in figures
+
+
+def test_command_prints_a_table_and_writes_tum(recorded, tmp_path, capsys):
+    folder, _ = recorded
+    assert main(["replay", str(folder), "--out", str(tmp_path / "poses.tum")]) == 0
+    table = capsys.readouterr().out
+    assert "600" in table
+    assert "RMSE" in table
+    assert "holding the last fix" in table
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "poses.tum"), np.loadtxt(folder / "poses.tum"))
+
+
+def test_a_folder_of_robots(recorded, tmp_path, capsys):
+    folder, _ = recorded
+    for file in (folder.parent / "idle").iterdir():
+        file.unlink()
+    assert robot_folders(folder.parent) == [folder]
+    assert main(["replay", str(folder.parent), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["recording"] == "rover"
+
+
+def test_the_motion_of_the_configuration(tmp_path, capsys):
+    folder = plain(tmp_path / "drive")
+    config = tmp_path / "room.toml"
+    robot = '[[robot]]\nname = "%s"\nmotion = "%s"\n[[robot.marker]]\nid = %d\nsize_mm = 60\n'
+    config.write_text(robot % ("rover", "free", 7))
+    assert main(["replay", str(folder), "--json", "--config", str(config)]) == 0
+    assert json.loads(capsys.readouterr().out)["motion"] == "free"
+    config.write_text(robot % ("rover", "free", 7) + robot % ("drive", "differential", 8))
+    assert main(["replay", str(folder), "--json", "--config", str(config)]) == 0
+    assert json.loads(capsys.readouterr().out)["motion"] == "differential"
+    assert main(["replay", str(folder), "--json", "--config", str(config), "--robot", "rober"]) != 0
+    error = capsys.readouterr().err
+    assert "rober" in error
+    assert "drive, rover" in error
+
+
+ROW = ",".join(map(str, circle.imu(np.array([0.0]))[0].tolist()))
+
+
+@pytest.mark.parametrize(
+    ("files", "says"),
+    [
+        ({"imu.csv": "t_s,gx,gy,gz,ax,ay\n0,0,0,0,0,0\n"}, r"imu.csv, line 1: no column az; found t_s, gx"),
+        (
+            {"imu.csv": "t_s,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n0.01,0,nan,0,0,0,9.8\n"},
+            r"imu.csv, line 3: gy is 'nan'",
+        ),
+        ({"imu.csv": "t_s,gx,gy,gz,ax,ay,az\n0,0,0,x1,0,0,9.8\n"}, r"imu.csv, line 2: gz is 'x1', a finite number"),
+        ({"imu.csv": "t_s,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n0.01,0,0\n"}, r"imu.csv, line 3: no value for gz"),
+        (
+            {"imu.csv": f"t_s,gx,gy,gz,ax,ay,az\n0.5{ROW[3:]}\n0.4{ROW[3:]}\n"},
+            r"imu.csv, line 3: t_s runs backwards, 0.4",
+        ),
+        ({"imu.csv": "t_s,gx,gy,gz,ax,ay,az\n"}, "imu.csv: no sample"),
+        ({"imu.csv": ""}, "imu.csv, line 1: no column t_s"),
+        ({"imu.csv": b"\x89PNG\r\n\x1a\n\xff\xfe"}, "imu.csv: this is no text file"),
+        ({"fixes.csv": None}, "fixes.csv: No such file"),
+        ({"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz\n"}, "fixes.csv: no fix"),
+        ({"fixes.csv": "t_s,x,y,z,qw,qx,qy,qz\n"}, "fixes.csv, line 1: no column arrival_s"),
+        ({"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz\n1,1.1,0,0,0,1,0,0,\n"}, "fixes.csv, line 2: no value for qz"),
+        (
+            {"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz\n1,1.1,0,0,0,2,0,0,0\n"},
+            "fixes.csv, line 2: quaternion of norm 2",
+        ),
+        ({"truth.csv": "t_s,x,y\n0,0,0\n"}, "truth.csv, line 1: no column z"),
+    ],
+)
+def test_a_recording_that_cannot_be_replayed_says_why_and_where(tmp_path, capsys, files, says):
+    folder = plain(tmp_path / "drive")
+    for name, content in files.items():
+        if content is None:
+            (folder / name).unlink()
+        else:
+            (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(RecordingError, match=says):
+        load(folder)
+    assert main(["replay", str(folder)]) != 0
+    error = capsys.readouterr().err
+    assert error.startswith("steadfix: ")
+    assert error.count("\n") == 1
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(RecordingError, match="no such folder"):
+        robot_folders(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match=r"neither it nor a folder in it holds an imu\.csv"):
+        robot_folders(tmp_path)
+
+
+def test_a_recording_is_not_written_over(recorded):
+    folder, _ = recorded
+    with pytest.raises(RecordingError, match="holds a recording already"):
+        Recorder(folder.parent, ["rover"])
+
+
+def test_columns_may_stand_in_any_order_and_sigmas_count(tmp_path):
+    folder = plain(tmp_path / "drive")
+    lines = (folder / "fixes.csv").read_text().splitlines()
+    turned = [",".join([*reversed(line.split(",")), "0.02,0.1"]) for line in lines]
+    turned[0] = ",".join([*reversed(lines[0].split(",")), "sigma_position,sigma_attitude"])
+    (folder / "fixes.csv").write_text("\n".join(turned))
+    recording = load(folder)
+    np.testing.assert_allclose(np.diag(recording.fixes[0].hypotheses[0].covariance), [4e-4] * 3 + [1e-2] * 3)
+    assert recording.fixes[0].t == 0.2
+    assert len(set(FIX_COLUMNS)) == len(FIX_COLUMNS)
+
+
+def test_hand_held_recording_with_mocap_truth():
+    recording = load(data("handheld_mocap"))
+    track, outcomes, _ = replay(recording, Localiser("handheld", FilterParams(), "free"))
+    error = track_error(track, recording.truth)
+    assert len(error.t) > 55000
+    assert 1e3 * error.position_rmse < 13.0
+    assert np.degrees(error.attitude_rmse) < 0.32
+    assert len(outcomes) == len(recording.fixes)
