@@ -58,7 +58,8 @@ def locate_camera(sightings: Sequence[MarkerSighting], anchors: Sequence[Anchor]
     if not seen:
         others = sorted({sighting.id for sighting in sightings})
         raise PlacementError(
-            f"no anchor marker is in view: {_listed(sorted(by_id))} expected, {_listed(others) or 'no marker'} seen"
+            f"no anchor is in view: {_listed(sorted(by_id))} expected, "
+            f"{_listed(others, 'marker') if others else 'no marker'} seen"
         )
     found = _fit(seen, intrinsics)
     if found is None:
@@ -145,5 +146,5 @@ def _worst_shift(
     return worst
 
 
-def _listed(ids: Sequence[int]) -> str:
-    return ("anchor " if len(ids) == 1 else "anchors ") + ", ".join(map(str, ids)) if ids else ""
+def _listed(ids: Sequence[int], noun: str = "anchor") -> str:
+    return f"{noun}{'s' * (len(ids) != 1)} {', '.join(map(str, ids))}"

@@ -113,8 +113,8 @@ _ENLARGE_UP_TO = 6_000_000
 # Contours shorter than four times this are noise. px
 _SMALLEST_SIDE_PX = 6.0
 
-# What a marker must reach, from 1 200 quadrilaterals around rendered markers (small, blurred, dark, moving, tilted) and
-# 16 000 in 30 photographs without one, in 8 dictionaries.
+# What a marker must reach. Chosen between 1 200 quadrilaterals around rendered markers (small, blurred, dark, moving,
+# tilted) and those that 31 photographs without one yield, 2 000 compared with each of 8 dictionaries.
 # Shortest side over cells, px
 _CELL_PX = 1.0
 # Correlation of cell means with the best marker
@@ -152,7 +152,7 @@ class MarkerDetector:
         self._decoder = _Decoder(self._dictionary)
         self._detector = cv2.aruco.ArucoDetector(self._dictionary, cv2.aruco.DetectorParameters())
         self._equaliser = cv2.createCLAHE(4.0, (8, 8))
-        self._first = len(_PASSES) - 1
+        self._ways: tuple[_Pass, ...] = ()
         self._frames = 0
         self._seen: frozenset[int] = frozenset()
 
@@ -166,32 +166,45 @@ class MarkerDetector:
     def detect(self, image: Pixels, t: float = 0.0, camera: str = "") -> list[MarkerSighting]:
         """The markers of the next frame of a stream, by id; `image` as in `grey`.
 
-        Looks in the one way that was enough at the last search. Searches again when a marker has just been lost, and
-        now and then while one of `ids` is missing (without `ids`: always, something new may have appeared).
+        Looks in the ways that were enough at the last search. Searches again when a marker has just been lost, and now
+        and then while one of `ids` is missing (without `ids`: always, something new may have appeared).
         """
         picture = grey(image)
         due = self._frames % _SEARCH_EVERY == 0
         self._frames += 1
-        found = [] if self._frames == 1 else self._look(picture, _PASSES[self._first])
-        ids = {marker.id for marker in found}
-        complete = self.ids is not None and ids >= self.ids
-        if not complete and (due or not ids >= self._seen):
+        found: list[_Found] = []
+        for way in self._ways:
+            found = _distinct(found + self._look(picture, way))
+            if self._complete(found):
+                break
+        if not self._complete(found) and (due or not self._seen <= {marker.id for marker in found}):
             found = self._search(picture, found)
         self._seen = frozenset(marker.id for marker in found)
         return self._sightings(found, t, camera)
 
     def _search(self, picture: Image, found: list[_Found]) -> list[_Found]:
-        most = 0
-        for k, way in enumerate(_PASSES):
+        by_way: dict[_Pass, set[int]] = {}
+        for way in _PASSES:
             if way.scale > 1.0 and picture.size > _ENLARGE_UP_TO:
                 continue
             new = self._look(picture, way)
-            if len(new) > most:
-                most, self._first = len(new), k
+            by_way[way] = {marker.id for marker in new}
             found = _distinct(found + new)
-            if self.ids is not None and {marker.id for marker in found} >= self.ids:
+            if self._complete(found):
                 break
+        # The way that found most, and those that found what it did not.
+        best = max(by_way, key=lambda way: len(by_way[way]))
+        covered = set(by_way[best])
+        ways = [best]
+        for way, ids in by_way.items():
+            if not ids <= covered:
+                ways.append(way)
+                covered |= ids
+        self._ways = tuple(ways)
         return found
+
+    def _complete(self, found: list[_Found]) -> bool:
+        return self.ids is not None and self.ids <= {marker.id for marker in found}
 
     def _look(self, picture: Image, way: _Pass) -> list[_Found]:
         """What one pass finds."""

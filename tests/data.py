@@ -1,4 +1,4 @@
-"""Where the real recordings and photos are. They are not part of the project."""
+"""The real recordings and photographs that tests are held against; they are not part of the project."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import pytest
 
 
 def data(folder: str) -> Path:
-    """A folder of the real data; the test is skipped where it is absent."""
-    root = os.environ.get("STEADFIX_DATA") or Path(__file__).parents[2] / "shared" / "data"
-    path = Path(root) / folder
-    if not path.is_dir():
-        pytest.skip(f"no real data: {path} is absent; STEADFIX_DATA names the folder that holds {folder}")
-    return path
+    """A folder of the real data: under STEADFIX_DATA, else beside the repository. Skips the test without it."""
+    root = Path(os.environ.get("STEADFIX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    if not (root / folder).is_dir():
+        pytest.skip(f"no real data: {root / folder} is absent (set STEADFIX_DATA)")
+    return root / folder
