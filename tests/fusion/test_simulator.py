@@ -222,9 +222,9 @@ def test_a_flip_is_the_other_pose_of_a_flat_marker() -> None:
 
 
 def test_the_filter_with_matched_noise_is_as_good_as_it_says() -> None:
-    """ANEES of 6 degrees of freedom over 4 runs of a minute; 0.94 to 1.06 where this was written, by seeds."""
+    """ANEES by its 6 degrees of freedom, just before each fix, over 20 runs of a minute: 0.97 +- 0.04 when written."""
     values = []
-    for seed in range(4):
+    for seed in range(20):
         simulation = simulate(random_ground(seed), seed, 60.0)
         localiser = Localiser("robot", motion="free")
         errors, covariances = [], []
@@ -242,4 +242,4 @@ def test_the_filter_with_matched_noise_is_as_good_as_it_says() -> None:
             localiser.feed(fix)
             at = stop
         values.append(nees(np.array(errors), np.array(covariances)).mean() / 6.0)
-    assert 0.8 < np.mean(values) < 1.2
+    assert 0.9 < np.mean(values) < 1.1
