@@ -62,7 +62,19 @@ ACCEL_COUNT = AUX + 21
 NEXT_T = AUX + 22  # s: stamp of the IMU sample that the state is on its way to
 NEXT_U = AUX + 23  # its input (6)
 BRIDGING = AUX + 29  # 1 while there is no IMU: constant velocity
-STATE = AUX + 30
+EXCESS = AUX + 30  # log of how much larger a variance is than its parameter says: accel, gyro, fix position, attitude
+SCALE = AUX + 34  # that as a factor, and 1 where it is not significant: of the two densities, of the fix's variances
+LAST_INNOVATION = AUX + 38  # the last fix's, each over its expected size (6)
+STILL_SINCE = AUX + 44  # s: since when every window has been at rest; inf while one is not
+STILL_FIXES = AUX + 45  # fixes taken since then
+REST_GYRO, REST_ACCEL = AUX + 46, AUX + 47  # least variance of a window seen so far, both (unit)^2
+CONSTRAINT_NIS = AUX + 48  # running mean of the squared innovation of each constraint over its expected one (4)
+STILL_MEAN = AUX + 52  # rad/s: mean rate of the last window (3)
+STILL_BARRED = AUX + 55  # s: not at rest until then, a fix has said otherwise
+MOVING_GYRO, MOVING_ACCEL = AUX + 56, AUX + 57  # mean variance of a window in motion
+STILL_SURE = AUX + 58  # 1 where rest and motion differ in that
+USUAL_SPEED2 = AUX + 59  # (m/s)^2: mean squared speed along an axis while the robot moves
+STATE = AUX + 60
 
 # --- Parameters, as numbers --------------------------------------------------------------------------------------
 (
@@ -90,9 +102,14 @@ STATE = AUX + 30
     GROUND_VELOCITY_SIGMA,
     GROUND_TILT_SIGMA,
     WHEEL_VELOCITY_SIGMA,
+    USUAL_SPEED,
+    STILL_SPEED,
+    STILL_RATE,
+    FIX_CORRELATION,
+    ADAPTATION,
     MOTION,
-) = range(25)
-PARAMS = 25
+) = range(30)
+PARAMS = 30
 FREE, GROUND, DIFFERENTIAL = 0.0, 1.0, 2.0
 
 # --- A fix: stamp, arrival, number of hypotheses, then per hypothesis position, quaternion, covariance, misfit -----
@@ -125,6 +142,13 @@ P_T_ACCEPTED, P_RESET_ID, P_T_IMU = 59, 60, 61
 POSE = 62
 
 GRID_HZ = 10.0  # pseudo-measurements come on a fixed grid of time, so that late fixes do not move them
+SPEED_TIME = 2.0  # s: for so long a robot keeps its speed
+LEAST_SPEED = 0.1  # m/s, along an axis: less is not learnt as usual
+STILL_WINDOW = 0.25  # s
+STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
+STILL_SPEED_SIGMA = 0.01  # m/s
+LEAVE_STILL = 9.35  # chi-square .975 at 3 degrees of freedom: a fix that is further off says that the robot moves
+STILL_PAUSE = 2.0  # s: and for so long it is believed
 GRAVITY_SIGMA = 0.5  # m/s2: how far the mean specific force before the start may be from gravity, by motion
 UNKNOWN_TILT_SIGMA = math.radians(30.0)  # of a flat marker whose two poses are too close to call
 
@@ -461,6 +485,8 @@ def _weigh(s, o, prm, fix, H, y, R, S):
                     total += B[m, i % 3] * half[3 * (i // 3) + m, j]
                 if i >= 3 and j >= 3:
                     total += unsure * (B[0, i - 3] * B[0, j - 3] + B[1, i - 3] * B[1, j - 3])
+                if (i < 3) == (j < 3):
+                    total *= s[SCALE + 2 + i // 3]
                 R[i, j] = total
                 # H P Hᵀ: row and column i of P are where H has its 1, DTD where it has its motion
                 a = o + COV + N * ((DP if i < 3 else TH - 3) + i)
@@ -561,6 +587,33 @@ def _initialise(s, prm, fix):
 
 
 @_jit
+def _adapt(s, prm, figures, most):
+    """Learn how much larger the noise is than its parameters, from the size and the sequence of innovations.
+
+    An innovation of the expected size has d² = dof. Noise understated in the process leaves innovations that follow
+    one another (the filter lags behind), noise understated in the fixes ones that alternate (it follows them too far):
+    R. Mehra, "Approaches to adaptive filtering", IEEE TAC 17(5), 1972. By that the blame is laid.
+    """
+    for block in range(2):
+        d2, product, length = 0.0, 0.0, 0.0
+        for i in range(3 * block, 3 * block + 3):
+            e = figures[F_INNOVATION - F_D2 + i] / figures[F_SIGMA - F_D2 + i]
+            d2 += e * e
+            product += e * s[LAST_INNOVATION + i]
+            length += s[LAST_INNOVATION + i] ** 2
+            s[LAST_INNOVATION + i] = e
+        follows = product / (math.sqrt(d2 * length) + 1.0)
+        more = min(d2 / 3.0 - 1.0, most)
+        to_process = min(max(0.5 + 1.0 * follows, 0.0), 1.0)
+        for k in range(2):
+            i = EXCESS + block + 2 * k
+            part = to_process if k == 0 else 1.0 - to_process
+            s[i] = min(max(s[i] + prm[ADAPTATION] * part * more, -1.0), 8.0)
+            factor = math.exp(max(s[i] - 0.7, 0.0))
+            s[SCALE + block + 2 * k] = math.sqrt(factor) if k == 0 else factor
+
+
+@_jit
 def _judge(s, prm, fix):
     """Believe a fix, or not: update the filter at T, and say in the fix's row what became of it.
 
@@ -579,10 +632,25 @@ def _judge(s, prm, fix):
         blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
         ratio = max(fix[F_D2] / prm[GATE], blocks)
         if o == MAIN:
+            if s[STILL_SINCE] < s[T]:
+                # A fix at rest repeats the error of the one before: of n fixes, a share of the variance does not
+                # average. R such that the variance after n of them is share + (1 - share)/n of one's.
+                n, share = s[STILL_FIXES] + 1.0, prm[FIX_CORRELATION]
+                s[STILL_FIXES] = n
+                if n > 1.0 and share > 0.0:
+                    before, after = share + (1.0 - share) / (n - 1.0), share + (1.0 - share) / n
+                    more = before * after / (before - after) - 1.0
+                    S += more * R
+                    R += more * R
             figures[:] = fix[F_D2:F_REPORTED]
+            if fix[F_D2_POSITION] > LEAVE_STILL:
+                s[STILL_SINCE] = math.inf
+                s[STILL_BARRED] = s[T] + STILL_PAUSE
             fix[F_OUTCOME] = INFLATED if ratio > 1.0 else ACCEPTED
         if ratio > prm[GATE_INFLATION]:
             continue
+        if o == MAIN:
+            _adapt(s, prm, figures, 6.0)
         if ratio > 1.0:
             # as if the fix were less certain, until it just passes
             R += (ratio - 1.0) * S
@@ -593,6 +661,10 @@ def _judge(s, prm, fix):
                 s[T_ACCEPTED] = s[T]
                 return
             agrees = True
+            # Rejects that agree: so far off is not the fix but the filter, unless they are turned, as flips are.
+            turned = figures[F_INNOVATION - F_D2 + 3 : F_SIGMA - F_D2]
+            angle = math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2)
+            _adapt(s, prm, figures, 6.0 if angle < prm[REINIT_ANGLE] else 0.0)
     fix[F_OUTCOME] = REJECTED
     fix[F_D2:F_REPORTED] = figures
     if not shadows:
@@ -628,31 +700,138 @@ def _judge(s, prm, fix):
 
 
 @_jit
-def _constrain(s, prm):
-    """Pseudo-measurements of a robot on the floor: no vertical speed, upright; on wheels: no sideways speed either."""
-    m = 4 if prm[MOTION] == DIFFERENTIAL else 3
-    H, y, R, B = np.empty((m, N)), np.empty(m), np.zeros((m, m)), np.empty((3, 3))
-    R[0, 0] = prm[GROUND_VELOCITY_SIGMA] ** 2
-    R[1, 1] = R[2, 2] = prm[GROUND_TILT_SIGMA] ** 2
-    for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-        _matrix(s, o, B)
-        H[:] = 0.0
-        # vertical speed in the world: e_zᵀ(v̂ + R̂ δv)
-        y[0] = -s[o + V + 2]
+def _watch(s, prm, imu, meta, k):
+    """Is the robot at rest? Looks back over the last window of samples, number k the newest."""
+    n = 0
+    mean, square = np.zeros(6), np.zeros(6)
+    t = imu[k & IMU_MASK, 0]
+    complete = False
+    while k - n >= meta[IMU_FIRST]:
+        row = (k - n) & IMU_MASK
+        if t - imu[row, 0] > STILL_WINDOW:
+            complete = True
+            break
+        for i in range(6):
+            # around the newest, so that no digits are lost to gravity
+            d = imu[row, 1 + i] - imu[k & IMU_MASK, 1 + i]
+            mean[i] += d
+            square[i] += d * d
+        n += 1
+    still = False
+    if complete and n >= 4:
+        gyro, accel, rate = 0.0, 0.0, 0.0
         for i in range(3):
-            H[0, DV + i] = B[2, i]
-        # up in body axes, u = Rᵀe_z, is (0, 0, 1): δu = [u]x δθ
-        y[1], y[2] = -B[2, 0], -B[2, 1]
-        H[1, 1], H[1, 2] = -B[2, 2], B[2, 1]
-        H[2, 0], H[2, 2] = B[2, 2], -B[2, 0]
-        if m == 4:
-            # speed along body y: δv_b = δv + [v_b]x δθ
-            R[3, 3] = prm[WHEEL_VELOCITY_SIGMA] ** 2
-            y[3] = -(B[0, 1] * s[o + V] + B[1, 1] * s[o + V + 1] + B[2, 1] * s[o + V + 2])
-            H[3, DV + 1] = 1.0
-            H[3, 0] = B[0, 2] * s[o + V] + B[1, 2] * s[o + V + 1] + B[2, 2] * s[o + V + 2]
-            H[3, 2] = -(B[0, 0] * s[o + V] + B[1, 0] * s[o + V + 1] + B[2, 0] * s[o + V + 2])
-        update(s, o, H, y, R)
+            gyro += (square[i] - mean[i] * mean[i] / n) / (n - 1)
+            accel += (square[3 + i] - mean[3 + i] * mean[3 + i] / n) / (n - 1)
+            r = imu[k & IMU_MASK, 1 + i] + mean[i] / n - s[BG + i]
+            rate += r * r
+            s[STILL_MEAN + i] = imu[k & IMU_MASK, 1 + i] + mean[i] / n
+        # The quietest window so far is the measure of rest; it is forgotten within minutes.
+        s[REST_GYRO] = min(s[REST_GYRO] * 1.001, gyro) if s[REST_GYRO] > 0.0 else gyro
+        s[REST_ACCEL] = min(s[REST_ACCEL] * 1.001, accel) if s[REST_ACCEL] > 0.0 else accel
+        speed2 = s[V] ** 2 + s[V + 1] ** 2 + s[V + 2] ** 2
+        if speed2 > 4.0 * prm[STILL_SPEED] ** 2:
+            s[MOVING_GYRO] += 0.02 * (gyro - s[MOVING_GYRO])
+            s[MOVING_ACCEL] += 0.02 * (accel - s[MOVING_ACCEL])
+            if t - s[T_ACCEPTED] < 1.0:
+                s[USUAL_SPEED2] += (speed2 / 3.0 - s[USUAL_SPEED2]) / (60.0 * GRID_HZ)
+        # Does motion show in the scatter at all? Not on a smooth floor; then the speed has to say it, more strictly.
+        s[STILL_SURE] = 0.0
+        if s[MOVING_GYRO] > 30.0 * s[REST_GYRO] or s[MOVING_ACCEL] > 30.0 * s[REST_ACCEL]:
+            s[STILL_SURE] = 1.0
+        # noise of n samples scatters too: 9 is three times the sigma, and a floor for sensors that round to zero
+        quiet = gyro <= 9.0 * s[REST_GYRO] + 1e-6 and accel <= 9.0 * s[REST_ACCEL] + 1e-4
+        unsure = 3.0 * math.sqrt(s[COV + (N + 1) * DBG] + s[COV + (N + 1) * (DBG + 1)] + s[COV + (N + 1) * (DBG + 2)])
+        sigma2 = s[COV + (N + 1) * DV] + s[COV + (N + 1) * (DV + 1)] + s[COV + (N + 1) * (DV + 2)]
+        sigma2 += STILL_SPEED_SIGMA * STILL_SPEED_SIGMA
+        still = (
+            quiet
+            and t > s[STILL_BARRED]
+            and math.sqrt(rate) < prm[STILL_RATE] + unsure
+            and speed2 < prm[STILL_SPEED] ** 2
+            and speed2 < (9.0 if s[STILL_SURE] > 0.0 else 2.25) * sigma2
+        )
+    if not still:
+        s[STILL_SINCE] = math.inf
+        s[STILL_FIXES] = 0.0
+    elif s[STILL_SINCE] == math.inf:
+        s[STILL_SINCE] = t
+
+
+@_jit
+def _loosened(variance, nis, y):
+    """The variance of a constraint that was violated by nis on the mean of late, and is by y now."""
+    return max(variance * max(nis, 1.0), y * y)
+
+
+@_jit
+def _constrain(s, prm):
+    """Pseudo-measurements, ten times a second.
+
+    At rest: no velocity, no rate. On the floor: no vertical speed, upright; on wheels: no sideways speed either. Each
+    of these is loosened by how much it has been violated of late. Always: robots do not go faster than they usually
+    do, by which a speed that nothing measures any more decays instead of being integrated for ever.
+    """
+    B = np.empty((3, 3))
+    still = s[STILL_SINCE] <= s[T] - (STILL_AFTER if s[STILL_SURE] > 0.0 else 2.0 * STILL_AFTER)
+    still_sigma = STILL_SPEED_SIGMA if s[STILL_SURE] > 0.0 else 3.0 * STILL_SPEED_SIGMA
+    wheels = prm[MOTION] == DIFFERENTIAL
+    for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
+        m = 0
+        H, y, R = np.zeros((9, N)), np.zeros(9), np.zeros((9, 9))
+        _matrix(s, o, B)
+        # along body axes: v_b = Rᵀv, δv_b = δv + [v_b]x δθ
+        body = np.zeros(3)
+        for i in range(3):
+            body[i] = B[0, i] * s[o + V] + B[1, i] * s[o + V + 1] + B[2, i] * s[o + V + 2]
+        for i in range(3):
+            if still:
+                variance = still_sigma * still_sigma
+            elif wheels and i == 1:
+                variance = _loosened(prm[WHEEL_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS + 3], body[1])
+            else:
+                # one in each 2 x SPEED_TIME is independent of the one before
+                variance = max(s[USUAL_SPEED2], LEAST_SPEED * LEAST_SPEED) * 2.0 * SPEED_TIME * GRID_HZ
+            y[m] = -body[i]
+            R[m, m] = variance
+            H[m, DV + i] = 1.0
+            H[m, (i + 1) % 3] = -body[(i + 2) % 3]
+            H[m, (i + 2) % 3] = body[(i + 1) % 3]
+            m += 1
+        if still:
+            sigma = 2.0 * prm[GYRO_NOISE] * math.sqrt(GRID_HZ)
+            for i in range(3):
+                y[m] = s[STILL_MEAN + i] - s[o + BG + i]
+                R[m, m] = sigma * sigma
+                H[m, DBG + i] = 1.0
+                m += 1
+        if prm[MOTION] != FREE:
+            # vertical speed in the world: e_zᵀ(v̂ + R̂ δv)
+            y[m] = -s[o + V + 2]
+            for i in range(3):
+                H[m, DV + i] = B[2, i]
+            R[m, m] = _loosened(prm[GROUND_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS], y[m])
+            m += 1
+            # up in body axes, u = Rᵀe_z, is (0, 0, 1): δu = [u]x δθ
+            y[m], y[m + 1] = -B[2, 0], -B[2, 1]
+            H[m, 1], H[m, 2] = -B[2, 2], B[2, 1]
+            H[m + 1, 0], H[m + 1, 2] = B[2, 2], -B[2, 0]
+            for i in range(1, 3):
+                R[m, m] = _loosened(prm[GROUND_TILT_SIGMA] ** 2, s[CONSTRAINT_NIS + i], y[m])
+                m += 1
+        if o == MAIN and prm[MOTION] != FREE and not still:
+            first = m - 3
+            for i in range(4 if wheels else 3):
+                a = first + i if i < 3 else 1
+                expected = R[a, a]
+                for c in range(N):
+                    for d in range(N):
+                        if H[a, c] != 0.0 and H[a, d] != 0.0:
+                            expected += H[a, c] * s[o + COV + N * c + d] * H[a, d]
+                # relative to the constraint as it was meant
+                loose = max(s[CONSTRAINT_NIS + i], 1.0)
+                s[CONSTRAINT_NIS + i] += 0.05 * (min(y[a] * y[a] / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
+        update(s, o, H[:m], y[:m], R[:m, :m])
 
 
 # -------------------------------------------------------------------------------------------------------- timeline
@@ -683,7 +862,7 @@ def _run_to(s, prm, fixes, fix_end, t_end):
                 ax = s[U + 3] + 0.5 * part * (s[NEXT_U + 3] - s[U + 3])
                 ay = s[U + 4] + 0.5 * part * (s[NEXT_U + 4] - s[U + 4])
                 az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
-                rate_noise, force_noise = prm[GYRO_NOISE], prm[ACCEL_NOISE]
+                rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
                 for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
                     if s[BRIDGING] > 0.0:
                         # Straight on: the input that says so is the bias, and gravity seen from the body.
@@ -768,7 +947,8 @@ def _advance(s, prm, imu, fixes, checkpoints, meta, until, live):
         s[TRAILING] = trailing
         if trailing == 0.0:
             if s[INITIALISED] > 0.0:
-                if prm[MOTION] != FREE and math.floor(t * GRID_HZ) != math.floor(s[T_IMU] * GRID_HZ):
+                if math.floor(t * GRID_HZ) != math.floor(s[T_IMU] * GRID_HZ):
+                    _watch(s, prm, imu, meta, k)
                     _constrain(s, prm)
             else:
                 # mean over the last hundred samples or so
@@ -1025,6 +1205,10 @@ def new_memory(parameters: Array) -> Array:
     meta, prm, state, _, _, checkpoints = views(memory)
     prm[:] = parameters
     meta[HORIZON] = state[T] = state[T_IMU] = state[T_ACCEPTED] = -math.inf
+    state[STILL_SINCE] = math.inf
+    state[STILL_BARRED] = -math.inf
+    state[SCALE : SCALE + 4] = 1.0
+    state[USUAL_SPEED2] = prm[USUAL_SPEED] ** 2
     checkpoints[0] = state
     meta[CP_END] = 1.0
     return memory

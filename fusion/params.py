@@ -42,9 +42,9 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     velocity_sigma: Positive = 2.0
     """m/s: prior of the velocity at the first fix. Wide: with 0.5 a start at 3 m/s is refused fix after fix, and the
     second fix makes the prior matter no more."""
-    time_offset_sigma: NotNegative = 0.0
+    time_offset_sigma: NotNegative = 0.05
     """s: prior of the camera's time offset, to be added to a fix's stamp; 0 holds it at 0."""
-    tilt_sigma: NotNegative = 0.0
+    tilt_sigma: NotNegative = 0.035
     """rad: prior of the angle between the world's z axis and the vertical, about x and y; 0 holds it at 0."""
 
     stamp_jitter: NotNegative = 0.0
@@ -71,12 +71,24 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     reinit_patience: Positive = 15.0
     """s: after that long they do even if it does not. Longer than a wrong map entry is in view (8-10 s measured)."""
 
-    ground_velocity_sigma: Positive = 0.05
+    ground_velocity_sigma: Positive = 0.03
     """m/s: vertical speed of a robot on the floor, ten times a second."""
-    ground_tilt_sigma: Positive = 0.05
-    """rad: its roll and pitch, likewise; more than it is, since successive ones are the same error."""
-    wheel_velocity_sigma: Positive = 0.05
+    ground_tilt_sigma: Positive = 0.4
+    """rad: its roll and pitch, likewise. Wide, since it is the same error each time: with 0.05 a device that is held
+    askew is forced upright (handheld_mocap as "ground": 1.06 deg RMSE, 0.29 deg with this)."""
+    wheel_velocity_sigma: Positive = 0.03
     """m/s: sideways speed of a robot on wheels, ten times a second."""
+    usual_speed: Positive = 0.7
+    """m/s: root mean square of the speed along an axis while the robot moves, before it is learnt. A speed that nothing
+    measures any more decays by it."""
+    still_speed: NotNegative = 0.1
+    """m/s: largest estimated speed of a robot at rest; 0 switches the updates at rest off."""
+    still_rate: NotNegative = 0.02
+    """rad/s: largest mean rate of a robot at rest, beyond what its gyroscope bias may be."""
+    fix_correlation: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.1
+    """share of a fix's variance that repeats from fix to fix while the robot stands."""
+    adaptation: NotNegative = 0.15
+    """how fast the noise follows the innovations, per fix; 0 holds it."""
     no_imu_accel_noise: Positive = 1.0
     """m/s2/sqrt(Hz): how a robot without IMU data may change its velocity."""
     no_imu_rate_noise: Positive = 0.5

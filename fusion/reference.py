@@ -178,6 +178,10 @@ class _State:
         self.td_applied = 0.0
         self.reset_id = self.accepted_count = 0
         self.accel_mean, self.accel_count = np.zeros(3), 0
+        self.excess, self.scale, self.last_innovation = np.zeros(4), np.ones(4), np.zeros(6)
+        self.still_since, self.still_barred, self.still_sure, self.still_fixes = math.inf, -math.inf, False, 0
+        self.still_mean, self.rest, self.moving = np.zeros(3), np.zeros(2), np.zeros(2)
+        self.constraint_nis, self.usual_speed2 = np.zeros(4), 0.0
 
     def copy(self) -> _State:
         other = copy.copy(self)
@@ -199,6 +203,7 @@ class ReferenceTimeline:
         self._samples: list[tuple[float, ...]] = []
         self._fixes: list[Array] = []
         self._state = _State()
+        self._state.usual_speed2 = params.usual_speed**2
         self._checkpoints = [self._state.copy()]
         self._horizon = -math.inf
         self._figures = {"imu_duplicates": 0, "imu_late": 0, "rewinds": 0}
@@ -372,11 +377,10 @@ class ReferenceTimeline:
             if sample is not None:
                 if state.initialised:
                     grid = math.floor(t * k.GRID_HZ)
-                    if self._motion != "free" and (
-                        math.isinf(state.t_imu) or grid != math.floor(state.t_imu * k.GRID_HZ)
-                    ):
+                    if math.isinf(state.t_imu) or grid != math.floor(state.t_imu * k.GRID_HZ):
+                        self._watch(state)
                         for f in state.filters:
-                            self._constrain(f)
+                            self._constrain(state, f)
                 else:
                     state.accel_count = min(state.accel_count + 1, 100)
                     step = (np.array(sample[4:]) - state.accel_mean) / state.accel_count
@@ -408,7 +412,8 @@ class ReferenceTimeline:
                         noise = (p.no_imu_rate_noise, p.no_imu_accel_noise, p.gyro_bias_walk, p.accel_bias_walk)
                         f.move(f.gyro_bias, force, dt, noise)
                     else:
-                        noise = (p.gyro_noise, p.accel_noise, p.gyro_bias_walk, p.accel_bias_walk)
+                        white = (p.gyro_noise * state.scale[1], p.accel_noise * state.scale[0])
+                        noise = (*white, p.gyro_bias_walk, p.accel_bias_walk)
                         f.move(mean[:3], mean[3:], dt, noise)
                 state.u = ahead
                 state.t = t
@@ -463,7 +468,7 @@ class ReferenceTimeline:
         scores = []
         for i in range(int(fix[k.F_COUNT])):
             H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
-            S = H @ f.P @ H.T + R
+            S = H @ f.P @ H.T + self._rescaled(state, R)
             scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
         chosen = int(np.argmin(scores))
         margin = abs(scores[0] - scores[1]) if len(scores) == 2 else math.inf
@@ -471,6 +476,7 @@ class ReferenceTimeline:
         if margin < self._params.hypothesis_margin:
             B = f.rotation
             R[3:, 3:] += k.UNKNOWN_TILT_SIGMA**2 * (np.outer(B[0], B[0]) + np.outer(B[1], B[1]))
+        R = self._rescaled(state, R)
         S = H @ f.P @ H.T + R
         fix[k.F_D2] = _d2(S, y)
         fix[k.F_D2_POSITION] = _d2(S[:3, :3], y[:3])
@@ -481,12 +487,45 @@ class ReferenceTimeline:
         fix[k.F_SIGMA : k.F_SIGMA + 6] = np.sqrt(np.diag(S))
         return H, y, R, S
 
+    @staticmethod
+    def _rescaled(state: _State, R: Array) -> Array:
+        R = R.copy()
+        R[:3, :3] *= state.scale[2]
+        R[3:, 3:] *= state.scale[3]
+        return R
+
+    def _adapt(self, state: _State, figures: Array, most: float) -> None:
+        """See `kernels._adapt`."""
+        e = figures[k.F_INNOVATION - k.F_D2 :][:6] / figures[k.F_SIGMA - k.F_D2 :][:6]
+        before, state.last_innovation = state.last_innovation, e
+        state.excess, state.scale = state.excess.copy(), state.scale.copy()
+        for block, half in enumerate((slice(0, 3), slice(3, 6))):
+            d2 = e[half] @ e[half]
+            follows = (e[half] @ before[half]) / (math.sqrt(d2 * (before[half] @ before[half])) + 1.0)
+            more = min(d2 / 3.0 - 1.0, most)
+            to_process = min(max(0.5 + follows, 0.0), 1.0)
+            for i, part in ((block, to_process), (block + 2, 1.0 - to_process)):
+                state.excess[i] = min(max(state.excess[i] + self._params.adaptation * part * more, -1.0), 8.0)
+                factor = math.exp(max(state.excess[i] - 0.7, 0.0))
+                state.scale[i] = math.sqrt(factor) if i < 2 else factor
+
     def _judge(self, state: _State, fix: Array) -> None:
         p = self._params
         main = state.main
         H, y, R, S = self._weigh(state, main, fix)
         ratio = self._gate_ratio(fix)
+        figures = fix[k.F_D2 : k.F_REPORTED].copy()
+        if state.still_since < state.t:
+            state.still_fixes = n = state.still_fixes + 1
+            share = p.fix_correlation
+            if n > 1 and share > 0.0:
+                one, two = (share + (1.0 - share) / i for i in (n - 1, n))
+                more = one * two / (one - two) - 1.0
+                S, R = S + more * R, R + more * R
+        if fix[k.F_D2_POSITION] > k.LEAVE_STILL:
+            state.still_since, state.still_barred = math.inf, state.t + k.STILL_PAUSE
         if ratio <= p.gate_inflation:
+            self._adapt(state, figures, 6.0)
             fix[k.F_OUTCOME] = k.ACCEPTED
             if ratio > 1.0:
                 fix[k.F_OUTCOME] = k.INFLATED
@@ -497,7 +536,6 @@ class ReferenceTimeline:
             state.t_accepted = state.t
             return
         fix[k.F_OUTCOME] = k.REJECTED
-        figures = fix[k.F_D2 : k.F_REPORTED].copy()
         if state.shadow is None:
             state.rejected_since = state.t
         patient = state.t - state.rejected_since >= p.reinit_patience
@@ -511,6 +549,8 @@ class ReferenceTimeline:
             fix[k.F_D2 : k.F_REPORTED] = figures
         if state.shadow is not None and agrees:
             state.shadow.correct(H, y, R)
+            angle = float(np.linalg.norm(figures[k.F_INNOVATION - k.F_D2 + 3 : k.F_SIGMA - k.F_D2]))
+            self._adapt(state, figures, 6.0 if angle < p.reinit_angle else 0.0)
             state.shadow_count += 1
             take = state.shadow_count >= p.reinit_count and (
                 patient or not known or self._attitudes_agree(state, main, state.shadow)
@@ -542,21 +582,77 @@ class ReferenceTimeline:
             return True
         return state.shadow_count >= 2 * p.reinit_count and float(np.linalg.norm(y)) <= p.reinit_angle
 
-    def _constrain(self, f: ErrorStateFilter) -> None:
+    def _watch(self, state: _State) -> None:
+        """Is the robot at rest? See `kernels._watch`."""
         p = self._params
-        up = f.rotation.T[:, 2]
-        speed = f.rotation.T @ f.velocity
-        H, y = np.zeros((4, N)), np.zeros(4)
-        H[0, DV] = up
-        y[0] = -f.velocity[2]
-        H[1:3, TH] = skew(up)[:2]
-        y[1:3] = -up[:2]
-        H[3, TH] = skew(speed)[1]
-        H[3, 4] = 1.0
-        y[3] = -speed[1]
-        sigmas = [p.ground_velocity_sigma, p.ground_tilt_sigma, p.ground_tilt_sigma, p.wheel_velocity_sigma]
-        m = 4 if self._motion == "differential" else 3
-        f.correct(H[:m], y[:m], np.diag(np.square(sigmas[:m])))
+        t = state.t
+        first = bisect.bisect_left(self._samples, t - k.STILL_WINDOW, key=lambda sample: sample[0])
+        window = np.array(self._samples[first : state.imu_cursor + 1])[:, 1:]
+        still = False
+        if first > 0 and len(window) >= 4:
+            variance = window.var(axis=0, ddof=1)
+            scatter = np.array([variance[:3].sum(), variance[3:].sum()])
+            state.still_mean = window[:, :3].mean(axis=0)
+            rate = float(np.linalg.norm(state.still_mean - state.main.gyro_bias))
+            state.rest = np.where(state.rest > 0.0, np.minimum(state.rest * 1.001, scatter), scatter)
+            speed2 = float(state.main.velocity @ state.main.velocity)
+            if speed2 > 4.0 * p.still_speed**2:
+                state.moving = state.moving + 0.02 * (scatter - state.moving)
+                if t - state.t_accepted < 1.0:
+                    state.usual_speed2 += (speed2 / 3.0 - state.usual_speed2) / (60.0 * k.GRID_HZ)
+            state.still_sure = bool((state.moving > 30.0 * state.rest).any())
+            unsure = 3.0 * math.sqrt(np.trace(state.main.P[DBG, DBG]))
+            sigma2 = float(np.trace(state.main.P[DV, DV])) + k.STILL_SPEED_SIGMA**2
+            still = bool(
+                (scatter <= 9.0 * state.rest + [1e-6, 1e-4]).all()
+                and t > state.still_barred
+                and rate < p.still_rate + unsure
+                and speed2 < p.still_speed**2
+                and speed2 < (9.0 if state.still_sure else 2.25) * sigma2
+            )
+        if not still:
+            state.still_since, state.still_fixes = math.inf, 0
+        elif math.isinf(state.still_since):
+            state.still_since = t
+
+    def _constrain(self, state: _State, f: ErrorStateFilter) -> None:
+        """Pseudo-measurements, see `kernels._constrain`: rows of H, innovations and variances."""
+        p = self._params
+        ground, wheels = self._motion != "free", self._motion == "differential"
+        factor = 1.0 if state.still_sure else 3.0
+        still = state.still_since <= state.t - k.STILL_AFTER * (1.0 if state.still_sure else 2.0)
+
+        def loosened(sigma: float, i: int, y: float) -> float:
+            return max(sigma**2 * max(state.constraint_nis[i], 1.0), y * y)
+
+        body = f.rotation.T @ f.velocity
+        H = np.zeros((9, N))
+        H[:3, DV], H[:3, TH] = _I3, skew(body)
+        usual = max(state.usual_speed2, k.LEAST_SPEED**2) * 2.0 * k.SPEED_TIME * k.GRID_HZ
+        variances = [(factor * k.STILL_SPEED_SIGMA) ** 2 if still else usual] * 3
+        if wheels and not still:
+            variances[1] = loosened(p.wheel_velocity_sigma, 3, body[1])
+        y = list(-body)
+        if still:
+            H[3:6, DBG] = _I3
+            y += list(state.still_mean - f.gyro_bias)
+            variances += [(2.0 * p.gyro_noise) ** 2 * k.GRID_HZ] * 3
+        if ground:
+            up = f.rotation.T[:, 2]
+            m = len(y)
+            H[m, DV] = up
+            H[m + 1 : m + 3, TH] = skew(up)[:2]
+            y += [-f.velocity[2], -up[0], -up[1]]
+            sigmas = (p.ground_velocity_sigma, p.ground_tilt_sigma, p.ground_tilt_sigma)
+            variances += [loosened(sigma, i, y[m + i]) for i, sigma in enumerate(sigmas)]
+        m = len(y)
+        if f is state.main and ground and not still:
+            state.constraint_nis = state.constraint_nis.copy()
+            for i, row in enumerate([m - 3, m - 2, m - 1, 1] if wheels else [m - 3, m - 2, m - 1]):
+                expected = variances[row] + H[row] @ f.P @ H[row]
+                now = min(y[row] ** 2 / expected, 9.0) * max(state.constraint_nis[i], 1.0)
+                state.constraint_nis[i] += 0.05 * (now - state.constraint_nis[i])
+        f.correct(H[:m], np.array(y), np.diag(variances))
 
     def _pose(self, state: _State) -> Array:
         f = state.main

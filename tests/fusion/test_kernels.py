@@ -23,6 +23,7 @@ def some_state(rng):
     s[k.BA : k.BA + 3] = rng.normal(0.0, 0.2, 3)
     s[k.TD] = 0.01
     s[k.TILT : k.TILT + 2] = rng.normal(0.0, 0.02, 2)
+    s[k.SCALE : k.SCALE + 4] = 1.0
     return s
 
 
@@ -149,18 +150,27 @@ def test_fix_jacobian_equals_central_differences():
     np.testing.assert_allclose(H[:, k.DTD], -slope, atol=1e-7)
 
 
-@pytest.mark.parametrize("motion", ["ground", "differential"])
-def test_constraint_jacobian_equals_central_differences(motion):
-    """One constraint at a time, by how far each direction of error is pulled: K ∝ P Hᵀ."""
+@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize("motion", ["free", "ground", "differential"])
+def test_constraint_jacobian_equals_central_differences(motion, still):
+    """All constraints at once, against an update with what differences make of their definition."""
     rng = np.random.default_rng(4)
     s = some_state(rng)
+    s[k.V : k.V + 3] *= 0.01
     prm = parameter_vector(FilterParams(), motion)
+    s[k.USUAL_SPEED2] = 0.5
+    s[k.STILL_SINCE] = s[k.T] - 10.0 if still else np.inf
+    s[k.STILL_SURE] = 1.0
+    s[k.STILL_MEAN : k.STILL_MEAN + 3] = [0.01, 0.02, -0.03]
 
     def prediction(state):
         R = rotation_from_quaternion(state[k.Q : k.Q + 4])
-        body = R.T @ state[k.V : k.V + 3]
-        values = [state[k.V + 2], *R.T[:2, 2]]
-        return np.array([*values, body[1]] if motion == "differential" else values)
+        values = list(R.T @ state[k.V : k.V + 3])
+        if still:
+            values += list(state[k.BG : k.BG + 3])
+        if motion != "free":
+            values += [state[k.V + 2], *R.T[:2, 2]]
+        return np.array(values)
 
     h = 1e-6
     m = len(prediction(s))
@@ -169,10 +179,19 @@ def test_constraint_jacobian_equals_central_differences(motion):
         dx = np.zeros(k.N)
         dx[i] = h
         H[:, i] = (prediction(moved(s, dx)) - prediction(moved(s, -dx))) / (2.0 * h)
+    y = -prediction(s)
+    variances = [k.STILL_SPEED_SIGMA**2 if still else 0.5 * 2.0 * k.SPEED_TIME * k.GRID_HZ] * 3
+    if motion == "differential" and not still:
+        variances[1] = max(prm[k.WHEEL_VELOCITY_SIGMA] ** 2, y[1] ** 2)
+    if still:
+        y[3:6] += s[k.STILL_MEAN : k.STILL_MEAN + 3]
+        variances += [(2.0 * prm[k.GYRO_NOISE]) ** 2 * k.GRID_HZ] * 3
+    if motion != "free":
+        sigmas = [prm[k.GROUND_VELOCITY_SIGMA], *[prm[k.GROUND_TILT_SIGMA]] * 2]
+        variances += [max(sigma**2, value**2) for sigma, value in zip(sigmas, y[-3:], strict=True)]
     P = some_covariance(rng)
-    sigmas = [prm[k.GROUND_VELOCITY_SIGMA], *[prm[k.GROUND_TILT_SIGMA]] * 2, prm[k.WHEEL_VELOCITY_SIGMA]][:m]
-    S = H @ P @ H.T + np.diag(np.square(sigmas))
-    expected = moved(s, P @ H.T @ np.linalg.solve(S, -prediction(s)))
+    S = H @ P @ H.T + np.diag(variances)
+    expected = moved(s, P @ H.T @ np.linalg.solve(S, y))
     s[k.COV : k.COV + k.N * k.N] = P.ravel()
     k._constrain(s, prm)
     np.testing.assert_allclose(s[: k.COV - 1], expected[: k.COV - 1], atol=1e-6)
