@@ -291,6 +291,8 @@ class _Decoder:
             cells = fine.reshape(shape).mean(axis=(2, 4))
             turned = np.stack([np.rot90(cells, turn, axes=(1, 2)) for turn in range(4)], axis=1)
             templates.append(_normalised(turned.reshape(len(cells), 4, -1)))
+        # By marker, made when it is first seen: (blur, sample)
+        self._pictures: dict[int, NDArray[np.floating]] = {}
         # (blur, marker, turn, cell)
         self._templates = np.array(templates, np.float32)
         middles = (np.arange(self.cells * _PER_CELL) + 0.5) / (self.cells * _PER_CELL)
@@ -340,8 +342,10 @@ class _Decoder:
         n = len(samples)
         cells = samples.reshape(n, self.cells, _PER_CELL, self.cells, _PER_CELL).mean(axis=(2, 4)).reshape(n, -1)
         blurs, markers, turns, size = self._templates.shape
-        all_likenesses = _normalised(cells) @ self._templates.reshape(-1, size).T
-        by_blur = all_likenesses.reshape(n, blurs, markers * turns)
+        # Not numpy's product: its BLAS wakes threads, which on a busy machine cost more than they bring.
+        templates = self._templates.reshape(-1, size)
+        products = cv2.gemm(_normalised(cells), templates, 1.0, None, 0.0, flags=cv2.GEMM_2_T)  # type: ignore[call-overload]
+        by_blur = np.asarray(products, np.float32).reshape(n, blurs, markers * turns)
         every = np.arange(n)
         blur = by_blur.max(axis=2).argmax(axis=1)
         likeness = by_blur[every, blur].reshape(n, markers, turns)
@@ -354,11 +358,12 @@ class _Decoder:
 
     def _likeness(self, samples: NDArray[np.float32], marker: int, turn: int) -> float:
         """Correlation of all samples with one marker, at the blur that suits best."""
-        seen = _normalised(samples.reshape(1, -1))[0]
-        code = self._codes[marker]
-        return max(
-            float(_normalised(np.rot90(blur @ code @ blur.T, turn).reshape(1, -1))[0] @ seen) for blur in self._blurs
-        )
+        if marker not in self._pictures:
+            code = self._codes[marker]
+            pictures = np.array([(blur @ code @ blur.T).ravel() for blur in self._blurs])
+            self._pictures[marker] = _normalised(pictures.astype(np.float32))
+        upright = np.rot90(samples, -turn).reshape(1, -1)
+        return float((self._pictures[marker] * _normalised(upright)).sum(axis=1).max())
 
 
 def _normalised(values: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -403,8 +408,8 @@ def refine_corners(image: Image, corners_px: Array, cells: int) -> tuple[Array, 
     shorter = np.clip(3.0 * blur.max(axis=1), 1.5, 0.75 * reach + 0.4)
     corners, noise, blur, still_clear = _refine_once(image, corners, shorter)
     clear &= still_clear & (np.linalg.norm(corners - start, axis=2).max(axis=1) <= np.maximum(reach, 2.0))
-    # Blur brings the next cells' edges into the profile: on rendered markers of 13 to 70 px under blur of 0.5 to 5 px the
-    # corners' error is what the edges' width exceeds this part of a cell by.
+    # Blur brings the next cells' edges into the profile: on rendered markers of 13 to 70 px under blur of 0.5 to 5 px
+    # the corners' error is what the edges' width exceeds this part of a cell by.
     crowding = np.maximum(blur - 0.185 * cell[:, None], 0.0)
     sigma = np.sqrt(SIGMA_FLOOR_PX**2 + noise**2 + np.square(crowding).mean(axis=1))
     sigma = np.where(clear, sigma, np.maximum(sigma, SIGMA_UNREFINED_PX))
@@ -437,8 +442,8 @@ def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Arr
     rise = np.maximum(rise - 0.15 * rise.max(axis=-1, keepdims=True), 0.0)
     between = 0.5 * (across[1:] + across[:-1])
     total = np.maximum(rise.sum(axis=-1), 1e-9)
-    edge = (rise @ between) / total
-    spread = np.sqrt(np.maximum((rise @ between**2) / total - edge**2, 0.0))
+    edge = np.einsum("nijks,s->nijk", rise, between) / total
+    spread = np.sqrt(np.maximum(np.einsum("nijks,s->nijk", rise, between**2) / total - edge**2, 0.0))
     edge *= reach[:, None, None, None]
     blur = np.median(spread, axis=-1).reshape(n, 8) * reach[:, None]
     fifth = _SAMPLES // 5
