@@ -104,6 +104,7 @@ class _Pass:
 _PASSES = (
     _Pass(0.5, windows=(13, 13, 10)),
     _Pass(windows=(13, 13, 10)),
+    _Pass(0.5, equalise=True, windows=(13, 13, 10)),
     _Pass(),
     _Pass(equalise=True),
     _Pass(2.0, windows=(5, 45, 20)),
@@ -450,25 +451,26 @@ def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Arr
     contrast = profile[..., -fifth:].mean(axis=-1) - profile[..., :fifth].mean(axis=-1)
     valid = (contrast > 0.4 * np.median(contrast, axis=(1, 2, 3), keepdims=True)) & (contrast > 2.0)
 
-    # edge = a + b u along each leg, by least squares reweighted with Tukey's biweight
-    powers = np.stack([np.ones_like(u), u], axis=-1)
+    # edge = offset + slope u along each leg, by least squares reweighted with Tukey's biweight
     weight = valid.astype(np.float64)
     for _ in range(4):
-        normal = np.einsum("nijkp,nijk,nijkq->nijpq", powers, weight, powers) + 1e-9 * np.eye(2)
-        inverse = np.linalg.inv(normal)
-        fit = np.einsum("nijpq,nijkq,nijk->nijp", inverse, powers, weight * edge)
-        residual = edge - np.einsum("nijkp,nijp->nijk", powers, fit)
+        wu = weight * u
+        s0, s1, s2 = weight.sum(axis=-1), wu.sum(axis=-1), (wu * u).sum(axis=-1)
+        t0, t1 = (weight * edge).sum(axis=-1), (wu * edge).sum(axis=-1)
+        determinant = s0 * s2 - s1 * s1 + 1e-9
+        offset, slope = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
+        residual = edge - offset[..., None] - slope[..., None] * u
         scale = 4.685 * np.maximum(1.4826 * _median_where(np.abs(residual), valid), 0.03)
         weight = valid * np.square(np.maximum(1.0 - np.square(residual / scale[:, None, None, None]), 0.0))
     support = weight.sum(axis=-1)
     variance = (weight * residual**2).sum(axis=(1, 2, 3)) / np.maximum(support.sum(axis=(1, 2)), 1e-9)
     # Variance of a leg's offset at the corner over that of a profile; profiles within a pixel see the same noise.
-    at_corner = inverse[..., 0, 0] * np.maximum(1.0, _PROFILES / np.minimum(length, _LEG_PX))
+    at_corner = s2 / determinant * np.maximum(1.0, _PROFILES / np.minimum(length, _LEG_PX))
     sigma = np.sqrt(variance * at_corner.mean(axis=(1, 2)))
 
     # Where the lines of the two legs meet
-    on_line = corners[:, :, None] + fit[..., :1] * outward
-    direction = along + fit[..., 1:] * outward
+    on_line = corners[:, :, None] + offset[..., None] * outward
+    direction = along + slope[..., None] * outward
     (p, q), (v, w) = np.moveaxis(on_line, 2, 0), np.moveaxis(direction, 2, 0)
     cross = v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]
     between_lines = (q - p)[..., 0] * w[..., 1] - (q - p)[..., 1] * w[..., 0]
