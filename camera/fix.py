@@ -91,7 +91,7 @@ def rays(corners_px: Array, intrinsics: Intrinsics) -> Array:
 
 
 def chi_square_limit(degrees_of_freedom: int) -> float:
-    """The .999 quantile of the chi-square distribution, by Wilson and Hilferty (1931), within 2 % from 2 up."""
+    """The .999 quantile of the chi-square distribution, by Wilson and Hilferty (1931), within 3 % from 2 up."""
     k = 2.0 / (9.0 * degrees_of_freedom)
     return float(degrees_of_freedom * (1.0 - k + 3.0902 * math.sqrt(k)) ** 3)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera.calibration import Intrinsics
-from camera.fix import MarkerMount, View, marker_corners, rays, solve_six
+from camera.fix import MarkerMount, View, chi_square_limit, marker_corners, rays, solve_six
 from camera.markers import MarkerSighting
 from fusion.geometry import inverse, skew, transform_points
 from fusion.measurements import Array
@@ -69,7 +69,8 @@ def locate_camera(sightings: Sequence[MarkerSighting], anchors: Sequence[Anchor]
     corners = 4 * len(seen)
     rms_sigma = math.sqrt(misfit / corners)
     mean_sigma_px = math.sqrt(float(np.mean([sighting.sigma_px**2 for _, sighting in seen])))
-    widened = max(1.0, misfit / (2 * corners - 6))
+    freedom = 2 * corners - 6
+    widened = misfit / freedom if misfit > chi_square_limit(freedom) else 1.0
     return Placement(world_from_camera, covariance * widened, rms_sigma * mean_sigma_px, ids)
 
 

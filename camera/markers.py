@@ -104,6 +104,7 @@ class _Pass:
 _PASSES = (
     _Pass(0.5, windows=(13, 13, 10)),
     _Pass(windows=(13, 13, 10)),
+    _Pass(0.5, equalise=True, windows=(13, 13, 10)),
     _Pass(),
     _Pass(equalise=True),
     _Pass(2.0, windows=(5, 45, 20)),
@@ -114,13 +115,14 @@ _ENLARGE_UP_TO = 6_000_000
 _SMALLEST_SIDE_PX = 6.0
 
 # What a marker must reach. Chosen between 1 200 quadrilaterals around rendered markers (small, blurred, dark, moving,
-# tilted) and those that 31 photographs without one yield, 2 000 compared with each of 8 dictionaries.
+# tilted) and those that 45 photographs yield, compared with 10 dictionaries: every rendered marker that OpenCV reads is
+# read, and no marker that is not there.
 # Shortest side over cells, px
 _CELL_PX = 1.0
 # Correlation of cell means with the best marker
 _CELLS = 0.85
 # What the best marker leaves unexplained, as a part of what the next best leaves
-_AHEAD = 0.45
+_AHEAD = 0.36
 # The same two before the corners are measured
 _FIRST_LOOK = 0.65, 0.9
 # Correlation of the picture within the cells: thin strokes can have the right means, but not this. The second where
@@ -290,6 +292,8 @@ class _Decoder:
             cells = fine.reshape(shape).mean(axis=(2, 4))
             turned = np.stack([np.rot90(cells, turn, axes=(1, 2)) for turn in range(4)], axis=1)
             templates.append(_normalised(turned.reshape(len(cells), 4, -1)))
+        # By marker, made when it is first seen: (blur, sample)
+        self._pictures: dict[int, NDArray[np.floating]] = {}
         # (blur, marker, turn, cell)
         self._templates = np.array(templates, np.float32)
         middles = (np.arange(self.cells * _PER_CELL) + 0.5) / (self.cells * _PER_CELL)
@@ -339,8 +343,10 @@ class _Decoder:
         n = len(samples)
         cells = samples.reshape(n, self.cells, _PER_CELL, self.cells, _PER_CELL).mean(axis=(2, 4)).reshape(n, -1)
         blurs, markers, turns, size = self._templates.shape
-        all_likenesses = _normalised(cells) @ self._templates.reshape(-1, size).T
-        by_blur = all_likenesses.reshape(n, blurs, markers * turns)
+        # Not numpy's product: its BLAS wakes threads, which on a busy machine cost more than they bring.
+        templates = self._templates.reshape(-1, size)
+        products = cv2.gemm(_normalised(cells), templates, 1.0, None, 0.0, flags=cv2.GEMM_2_T)  # type: ignore[call-overload]
+        by_blur = np.asarray(products, np.float32).reshape(n, blurs, markers * turns)
         every = np.arange(n)
         blur = by_blur.max(axis=2).argmax(axis=1)
         likeness = by_blur[every, blur].reshape(n, markers, turns)
@@ -353,11 +359,12 @@ class _Decoder:
 
     def _likeness(self, samples: NDArray[np.float32], marker: int, turn: int) -> float:
         """Correlation of all samples with one marker, at the blur that suits best."""
-        seen = _normalised(samples.reshape(1, -1))[0]
-        code = self._codes[marker]
-        return max(
-            float(_normalised(np.rot90(blur @ code @ blur.T, turn).reshape(1, -1))[0] @ seen) for blur in self._blurs
-        )
+        if marker not in self._pictures:
+            code = self._codes[marker]
+            pictures = np.array([(blur @ code @ blur.T).ravel() for blur in self._blurs])
+            self._pictures[marker] = _normalised(pictures.astype(np.float32))
+        upright = np.rot90(samples, -turn).reshape(1, -1)
+        return float((self._pictures[marker] * _normalised(upright)).sum(axis=1).max())
 
 
 def _normalised(values: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -402,9 +409,9 @@ def refine_corners(image: Image, corners_px: Array, cells: int) -> tuple[Array, 
     shorter = np.clip(3.0 * blur.max(axis=1), 1.5, 0.75 * reach + 0.4)
     corners, noise, blur, still_clear = _refine_once(image, corners, shorter)
     clear &= still_clear & (np.linalg.norm(corners - start, axis=2).max(axis=1) <= np.maximum(reach, 2.0))
-    # Blur beyond a sixth of a cell brings the next cells' edges into the profile: measured on rendered markers of 13 to
-    # 70 px under blur of 0.5 to 5 px, the corners' error grows as this, which is an upper bound for most of them.
-    crowding = 18.0 * cell[:, None] * np.square(np.maximum(blur / cell[:, None] - 0.16, 0.0))
+    # Blur brings the next cells' edges into the profile: on rendered markers of 13 to 70 px under blur of 0.5 to 5 px
+    # the corners' error is what the edges' width exceeds this part of a cell by.
+    crowding = np.maximum(blur - 0.185 * cell[:, None], 0.0)
     sigma = np.sqrt(SIGMA_FLOOR_PX**2 + noise**2 + np.square(crowding).mean(axis=1))
     sigma = np.where(clear, sigma, np.maximum(sigma, SIGMA_UNREFINED_PX))
     return np.where(clear[:, None, None], corners, start), sigma
@@ -433,36 +440,37 @@ def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Arr
     # The edge is the middle of the gradient. Only what grows brighter outwards and stands out counts: the rest is
     # noise, and would pull the edge to the middle of the profile.
     rise = np.maximum(np.diff(profile, axis=-1), 0.0)
-    rise = np.maximum(rise - 0.3 * rise.max(axis=-1, keepdims=True), 0.0)
+    rise = np.maximum(rise - 0.15 * rise.max(axis=-1, keepdims=True), 0.0)
     between = 0.5 * (across[1:] + across[:-1])
     total = np.maximum(rise.sum(axis=-1), 1e-9)
-    edge = (rise @ between) / total
-    spread = np.sqrt(np.maximum((rise @ between**2) / total - edge**2, 0.0))
+    edge = np.einsum("nijks,s->nijk", rise, between) / total
+    spread = np.sqrt(np.maximum(np.einsum("nijks,s->nijk", rise, between**2) / total - edge**2, 0.0))
     edge *= reach[:, None, None, None]
     blur = np.median(spread, axis=-1).reshape(n, 8) * reach[:, None]
     fifth = _SAMPLES // 5
     contrast = profile[..., -fifth:].mean(axis=-1) - profile[..., :fifth].mean(axis=-1)
     valid = (contrast > 0.4 * np.median(contrast, axis=(1, 2, 3), keepdims=True)) & (contrast > 2.0)
 
-    # edge = a + b u along each leg, by least squares reweighted with Tukey's biweight
-    powers = np.stack([np.ones_like(u), u], axis=-1)
+    # edge = offset + slope u along each leg, by least squares reweighted with Tukey's biweight
     weight = valid.astype(np.float64)
     for _ in range(4):
-        normal = np.einsum("nijkp,nijk,nijkq->nijpq", powers, weight, powers) + 1e-9 * np.eye(2)
-        inverse = np.linalg.inv(normal)
-        fit = np.einsum("nijpq,nijkq,nijk->nijp", inverse, powers, weight * edge)
-        residual = edge - np.einsum("nijkp,nijp->nijk", powers, fit)
+        wu = weight * u
+        s0, s1, s2 = weight.sum(axis=-1), wu.sum(axis=-1), (wu * u).sum(axis=-1)
+        t0, t1 = (weight * edge).sum(axis=-1), (wu * edge).sum(axis=-1)
+        determinant = s0 * s2 - s1 * s1 + 1e-9
+        offset, slope = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
+        residual = edge - offset[..., None] - slope[..., None] * u
         scale = 4.685 * np.maximum(1.4826 * _median_where(np.abs(residual), valid), 0.03)
         weight = valid * np.square(np.maximum(1.0 - np.square(residual / scale[:, None, None, None]), 0.0))
     support = weight.sum(axis=-1)
     variance = (weight * residual**2).sum(axis=(1, 2, 3)) / np.maximum(support.sum(axis=(1, 2)), 1e-9)
     # Variance of a leg's offset at the corner over that of a profile; profiles within a pixel see the same noise.
-    at_corner = inverse[..., 0, 0] * np.maximum(1.0, _PROFILES / np.minimum(length, _LEG_PX))
+    at_corner = s2 / determinant * np.maximum(1.0, _PROFILES / np.minimum(length, _LEG_PX))
     sigma = np.sqrt(variance * at_corner.mean(axis=(1, 2)))
 
     # Where the lines of the two legs meet
-    on_line = corners[:, :, None] + fit[..., :1] * outward
-    direction = along + fit[..., 1:] * outward
+    on_line = corners[:, :, None] + offset[..., None] * outward
+    direction = along + slope[..., None] * outward
     (p, q), (v, w) = np.moveaxis(on_line, 2, 0), np.moveaxis(direction, 2, 0)
     cross = v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]
     between_lines = (q - p)[..., 0] * w[..., 1] - (q - p)[..., 1] * w[..., 0]

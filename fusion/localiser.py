@@ -136,14 +136,57 @@ class Localiser:
         return self.pose_at(float(self._timeline.state[k.T]))
 
     @property
+    def last_fix(self) -> float:
+        """s: the instant of the newest accepted fix; -inf before the first."""
+        return float(self._timeline.state[k.T_ACCEPTED])
+
+    @property
     def gyro_bias(self) -> Array:
         """(3,) rad/s, body axes."""
         return self._timeline.state[k.BG : k.BG + 3].copy()
 
     @property
+    def gyro_bias_sigma(self) -> Array:
+        """(3,) rad/s."""
+        return self._sigma(k.DBG, 3)
+
+    @property
     def accel_bias(self) -> Array:
         """(3,) m/s2, body axes."""
         return self._timeline.state[k.BA : k.BA + 3].copy()
+
+    @property
+    def accel_bias_sigma(self) -> Array:
+        """(3,) m/s2."""
+        return self._sigma(k.DBA, 3)
+
+    @property
+    def time_offset(self) -> float:
+        """s: what is added to a fix's stamp; negative when the camera's stamps are late."""
+        return float(self._timeline.state[k.TD])
+
+    @property
+    def time_offset_sigma(self) -> float:
+        """s; 0 when the offset is held."""
+        return float(self._sigma(k.DTD, 1)[0])
+
+    @property
+    def tilt(self) -> Array:
+        """(2,): x and y of the unit vector upwards, in the world frame; nearly rad."""
+        return self._timeline.state[k.TILT : k.TILT + 2].copy()
+
+    @property
+    def tilt_covariance(self) -> Array:
+        """(2, 2): of the tilt; 0 when it is held."""
+        return self._covariance[k.DTILT : k.DTILT + 2, k.DTILT : k.DTILT + 2].copy()
+
+    @property
+    def _covariance(self) -> Array:
+        return self._timeline.state[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
+
+    def _sigma(self, first: int, n: int) -> Array:
+        sigma: Array = np.sqrt(np.diag(self._covariance)[first : first + n])
+        return sigma
 
     def pose_at(self, t: float) -> Pose | None:
         """The pose at instant t: of the past as far as the buffer reaches, or extrapolated into the near future.

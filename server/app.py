@@ -66,6 +66,8 @@ MAX_MESSAGE = 64 * 1024
 TRACKER_ROOM = 64 * 1024
 # s without a word after which a robot's connection is taken for dead, and another may take its place.
 SILENCE = 3.0
+# s until a robot must have said who it is.
+HELLO_TIMEOUT = 10.0
 # s between clock questions, for the first ones and then.
 CLOCK_FAST, CLOCK_FAST_COUNT, CLOCK_SLOW = 0.1, 10, 1.0
 # s that closing may take: for clients that do not answer, and for threads that hang in a driver.
@@ -340,15 +342,18 @@ class Service:
 
     def health(self) -> dict[str, Any]:
         now = time.monotonic()
-        robots = {name: robot.health(now) for name, robot in self.robots.items()}
+        # Asked before it is compiled, a filter would compile here and now.
+        robots = {name: robot.health(now, self.ready.is_set()) for name, robot in self.robots.items()}
         cameras = {name: camera.health(now) for name, camera in self.cameras.items()}
-        reasons = [] if self.ready.is_set() else ["the filters are being compiled"]
+        reasons = [] if self.ready.is_set() else ["the filters are being compiled, which may take a minute"]
         for name, camera in cameras.items():
             if camera["status"] != "ok":
                 reasons.append(f"camera {name}: {camera['status']}")
             elif not camera["located"]:
                 reasons.append(f"camera {name}: {camera['location']}")
         for name, robot in robots.items():
+            if not self.ready.is_set():
+                break
             if robot["imu"] != "ok":
                 reasons.append(f"robot {name}: {robot['imu']}")
             elif robot["mode"] != "FULL":
@@ -476,7 +481,14 @@ class Service:
 
     async def _serve_robot(self, visitor: _Visitor) -> None:
         connection = visitor.connection
-        hello = await self._hello(visitor)
+        try:
+            async with asyncio.timeout(HELLO_TIMEOUT):
+                hello = await self._hello(visitor)
+        except TimeoutError:
+            # It may not even read: no last word for it.
+            log.warning("%s has not said hello for %.0f s and was closed", visitor.name, HELLO_TIMEOUT)
+            connection.transport.abort()
+            return
         robot = self._known(hello.robot)
         if robot.config.imu.source != "websocket":
             raise RefusedError(f'the IMU of "{hello.robot}" is on {robot.config.imu.source}, by the configuration')

@@ -104,8 +104,9 @@ class Robot:
         # The first arrival only opens the window: its samples were taken before it.
         return sum(n for _, n in recent[1:]) / max(recent[-1][0] - recent[0][0], 1e-3)
 
-    def health(self, now: float) -> dict[str, Any]:
-        pose = self.localiser.pose_at(now)
+    def health(self, now: float, ready: bool = True) -> dict[str, Any]:
+        """What there is to say of it. `ready`: whether the filter may be asked."""
+        pose = self.localiser.pose_at(now) if ready else None
         delay = self.clock.minimum_delay
         trouble = self.trouble
         if not trouble and now - self.heard > 1.0:

@@ -37,8 +37,10 @@ def run(args: argparse.Namespace) -> int:
 
 async def _run(args: argparse.Namespace) -> int:
     stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        # Not the loop's own way, which loses a signal while the loop is too busy to read what threads tell it.
+        signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
     if args.config is not None:
         await _serve_until(stop, load(args.config), args)
         return 0

@@ -229,7 +229,7 @@ function fit() {
   for (const anchor of health?.anchors ?? []) points.push(anchor.position_m);
   for (const camera of Object.values(health?.cameras ?? {})) points.push(...(camera.view_m ?? []));
   for (const { place } of robots.values()) if (place) points.push(place.position);
-  const grown = bounds ?? { left: Infinity, right: -Infinity, bottom: Infinity, top: -Infinity };
+  const grown = bounds ? { ...bounds } : { left: Infinity, right: -Infinity, bottom: Infinity, top: -Infinity };
   const before = JSON.stringify(grown);
   for (const [x, y] of points) {
     if (!(x >= grown.left && x <= grown.right && y >= grown.bottom && y <= grown.top)) {
@@ -241,6 +241,12 @@ function fit() {
     }
   }
   if (points.length === 0 && !bounds) return { x: 0, y: 0, scale: Math.min(canvas.clientWidth, canvas.clientHeight) / 4 };
+  // A single anchor is not all there is to a room.
+  for (const [low, high] of [["left", "right"], ["bottom", "top"]]) {
+    const short = Math.max(0, (2 - (grown[high] - grown[low])) / 2);
+    grown[low] -= short;
+    grown[high] += short;
+  }
   bounds = grown;
   if (view && JSON.stringify(grown) === before) return view;
   const scale = Math.min(canvas.clientWidth / (grown.right - grown.left), canvas.clientHeight / (grown.top - grown.bottom));
@@ -337,7 +343,7 @@ function drawAnchor(anchor, toX, toY) {
   context.strokeRect(-half, -half, 2 * half, 2 * half);
   context.fillRect(-half, -half, half * 0.7, half * 0.7); // its top left corner
   context.restore();
-  label(String(anchor.id), x + half + 6, y, colours.anchor, "13px");
+  label(String(anchor.id), x + half + 6, y + half, colours.anchor, "13px");
 }
 
 function drawTrail(robot, toX, toY) {
@@ -366,17 +372,9 @@ function drawRobot(name, robot, toX, toY) {
   const { major, minor, angle } = ellipse(pose.covariance);
   context.save();
   context.translate(x, y);
-  context.fillStyle = context.strokeStyle = colour;
-  context.lineWidth = 1.5;
-  context.beginPath();
-  context.ellipse(0, 0, 2 * major * view.scale, 2 * minor * view.scale, -angle, 0, 2 * Math.PI);
-  context.globalAlpha = 0.16;
-  context.fill();
-  context.globalAlpha = 0.8;
-  context.stroke();
-  context.globalAlpha = 1;
   // An arrowhead about the robot's middle, with a rim that sets it off from the trail.
   const r = Math.min(Math.max(0.11 * view.scale, 12), 22);
+  context.save();
   context.rotate(-pose.yaw);
   context.beginPath();
   context.moveTo(r * 1.25, 0);
@@ -387,6 +385,19 @@ function drawRobot(name, robot, toX, toY) {
   context.strokeStyle = colours.floor;
   context.lineWidth = 4;
   context.stroke();
+  context.fillStyle = colour;
+  context.fill();
+  context.restore();
+  // Where it is to 2 sigma: light inside the arrowhead while it is that small, else around it.
+  context.beginPath();
+  context.ellipse(0, 0, 2 * major * view.scale, 2 * minor * view.scale, -angle, 0, 2 * Math.PI);
+  context.lineWidth = 3;
+  context.strokeStyle = colours.floor;
+  context.stroke();
+  context.lineWidth = 1.5;
+  context.strokeStyle = colour;
+  context.stroke();
+  context.globalAlpha = 0.14;
   context.fill();
   context.restore();
   label(lost ? `${name} was here` : name, x + r * 1.25 + 8, y - r * 0.9, colour, "16px");

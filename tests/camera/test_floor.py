@@ -37,17 +37,21 @@ def test_many_anchors_are_better_than_one():
     assert 0.03 < four.rms_px < 0.2
 
 
-def test_an_anchor_that_contradicts_the_others_is_named():
-    random = np.random.default_rng(6)
-    for wrong in (
-        transform(rotation_about_z(0.7), [0.9, -0.4, 0.0]),  # 0.2 m off
-        transform(rotation_about_z(0.7 + np.pi / 2), [0.9, -0.6, 0.0]),  # a quarter turn off
-    ):
-        believed = [ANCHORS[0], Anchor(41, 0.15, wrong), *ANCHORS[2:]]
-        with pytest.raises(PlacementError, match=r"anchor 41 is 0\.\d+ m away .* 40, 42, 43"):
-            locate_camera(seen(ANCHORS, random), believed, INTRINSICS)
-        with pytest.raises(PlacementError, match=r"contradict each other.*40 by.*41 by"):
-            locate_camera(seen(ANCHORS[:2], random), believed, INTRINSICS)
+SHIFTED = transform(rotation_about_z(0.7), [0.9, -0.4, 0.0])  # by 0.2 m
+TURNED = transform(rotation_about_z(0.7 + np.pi / 2), [0.9, -0.6, 0.0])  # by a right angle
+
+
+@pytest.mark.parametrize("wrong", [SHIFTED, TURNED], ids=["shifted", "turned"])
+def test_an_anchor_that_contradicts_the_others_is_named(wrong):
+    believed = [ANCHORS[0], Anchor(41, 0.15, wrong), *ANCHORS[2:]]
+    with pytest.raises(PlacementError, match=r"anchor 41 is 0\.\d+ m away .* 40, 42, 43"):
+        locate_camera(seen(ANCHORS, np.random.default_rng(6)), believed, INTRINSICS)
+
+
+def test_of_two_anchors_that_contradict_each_other_both_are_named():
+    believed = [ANCHORS[0], Anchor(41, 0.15, TURNED)]
+    with pytest.raises(PlacementError, match=r"contradict each other.*40 by.*41 by"):
+        locate_camera(seen(ANCHORS[:2], np.random.default_rng(6)), believed, INTRINSICS)
 
 
 def test_a_survey_that_is_wrong_by_millimetres_is_accepted_and_widens_the_covariance():

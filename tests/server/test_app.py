@@ -284,6 +284,16 @@ def test_before_the_hello_nothing_else_is_heard() -> None:
     run(main)
 
 
+def test_one_that_never_says_hello(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.app.HELLO_TIMEOUT", 0.1)
+
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            await connection.wait_closed()
+
+    run(main)
+
+
 def test_ten_megabytes() -> None:
     async def main() -> None:
         async with serving() as service:
