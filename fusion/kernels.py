@@ -74,7 +74,19 @@ STILL_BARRED = AUX + 55  # s: not at rest until then, a fix has said otherwise
 MOVING_GYRO, MOVING_ACCEL = AUX + 56, AUX + 57  # mean variance of a window in motion
 STILL_SURE = AUX + 58  # 1 where rest and motion differ in that
 USUAL_SPEED2 = AUX + 59  # (m/s)^2: mean squared speed along an axis while the robot moves
-STATE = AUX + 60
+CORRECTED = AUX + 60  # sum of all moves by updates, world axes: position (3), rotation vector (3)
+STATE = AUX + 66
+
+# --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
+E = 0  # world axes: position (3), rotation vector (3)
+E_T = 6  # s: the instant of E
+E_PUBLISHED = 7  # s: the latest instant that was asked for
+E_RESETS = 8  # how often the channel has stepped
+E_STEP = 9  # the last step: position (3), rotation vector (3)
+E_RESET_ID = 15  # the filter's, as last seen
+BEFORE = 16  # what the filter said before an input: T, position (3), quaternion (4), velocity (3), rate (3),
+BEFORE_CORRECTED = BEFORE + 14  # and CORRECTED (6)
+CHANNEL = BEFORE_CORRECTED + 6
 
 # --- Parameters, as numbers --------------------------------------------------------------------------------------
 (
@@ -139,11 +151,16 @@ CP_PER_BUFFER = 40  # a checkpoint each fortieth of the buffer: 50 ms by default
 # --- A pose as it leaves: t, position, quaternion, velocity, rate, covariance, velocity covariance, bookkeeping ----
 P_T, P_POS, P_QUAT, P_VEL, P_RATE, P_COV, P_VCOV = 0, 1, 4, 8, 11, 14, 50
 P_T_ACCEPTED, P_RESET_ID, P_T_IMU = 59, 60, 61
-POSE = 62
+P_STEP = 62  # of the last reset: position (3), rotation vector (3), world
+POSE = 68
 
 GRID_HZ = 10.0  # pseudo-measurements come on a fixed grid of time, so that late fixes do not move them
 SPEED_TIME = 2.0  # s: for so long a robot keeps its speed
 LEAST_SPEED = 0.1  # m/s, along an axis: less is not learnt as usual
+SMOOTH_TIME = 0.1  # s: E decays with this time constant,
+SMOOTH_SPEED, SMOOTH_RATE = 0.3, math.radians(60.0)  # m/s, rad/s: but not faster than this,
+SMOOTH_DISTANCE, SMOOTH_ANGLE = 0.25, math.radians(20.0)  # m, rad: and beyond this the channel steps, and says so
+SMOOTH_REACH = 0.5  # s: so far ahead of the newest input a published pose is kept from moving
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
 STILL_SPEED_SIGMA = 0.01  # m/s
@@ -352,6 +369,9 @@ def update(s, o, H, y, R):
     B = np.empty((3, 3))
     _matrix(s, o, B)
     for i in range(3):
+        if o == MAIN:
+            s[CORRECTED + i] += B[i, 0] * dx[DP] + B[i, 1] * dx[DP + 1] + B[i, 2] * dx[DP + 2]
+            s[CORRECTED + 3 + i] += B[i, 0] * dx[TH] + B[i, 1] * dx[TH + 1] + B[i, 2] * dx[TH + 2]
         s[o + V + i] += B[i, 0] * dx[DV] + B[i, 1] * dx[DV + 1] + B[i, 2] * dx[DV + 2]
         s[o + POS + i] += B[i, 0] * dx[DP] + B[i, 1] * dx[DP + 1] + B[i, 2] * dx[DP + 2]
     for i in range(DBG, N):
@@ -1104,15 +1124,113 @@ def _write_pose(s, out):
     out[P_T_IMU] = s[T_IMU]
 
 
-# ----------------------------------------------------------------------------------------------- called from Python
-
-FEED_SAMPLES, FEED_FIX, POSE_AT = range(3)
+# -------------------------------------------------------------------------------------------------- smooth channel
 
 
 @_jit
-def process(memory, task, t, inputs, outputs):
+def _rotate(rotation, r, q, at):
+    """q[at:at+4] <- Exp(rotation[r:r+3]) q[at:at+4]."""
+    x, y, z = rotation[r], rotation[r + 1], rotation[r + 2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    w, h = math.cos(0.5 * angle), (0.5 if angle < 1e-9 else math.sin(0.5 * angle) / angle)
+    x, y, z = h * x, h * y, h * z
+    a, b, c, d = q[at], q[at + 1], q[at + 2], q[at + 3]
+    q[at] = w * a - x * b - y * c - z * d
+    q[at + 1] = w * b + x * a + y * d - z * c
+    q[at + 2] = w * c - x * d + y * a + z * b
+    q[at + 3] = w * d + x * c - y * b + z * a
+
+
+@_jit
+def _left(ch, dt):
+    """What is left of E after dt s, as factors of its position and its rotation: it decays, but not too fast."""
+    left = np.ones(2)
+    if dt <= 0.0:
+        return left
+    decay = 1.0 - math.exp(-dt / SMOOTH_TIME)
+    for i in range(2):
+        size = math.sqrt(ch[E + 3 * i] ** 2 + ch[E + 3 * i + 1] ** 2 + ch[E + 3 * i + 2] ** 2)
+        if size > 0.0:
+            most = (SMOOTH_SPEED if i == 0 else SMOOTH_RATE) * dt
+            left[i] = 1.0 - min(decay, most / size)
+    return left
+
+
+@_jit
+def _move(out, position, quaternion, ch, dt):
+    """Move a pose of the filter by what is left of E after dt s."""
+    left = _left(ch, dt)
+    turn = np.empty(3)
+    for i in range(3):
+        out[position + i] += left[0] * ch[E + i]
+        turn[i] = left[1] * ch[E + 3 + i]
+    _rotate(turn, 0, out, quaternion)
+
+
+@_jit
+def _absorb(s, ch, plain):
+    """Set E such that the smooth pose does not move by what an input has done to the filter's."""
+    dt = s[T] - ch[E_T]
+    if dt > 0.0:
+        left = _left(ch, dt)
+        for i in range(6):
+            ch[E + i] *= left[i // 3]
+        ch[E_T] = s[T]
+    if plain:
+        # only pseudo-measurements, and the motion itself, which is none of E's business
+        for i in range(6):
+            ch[E + i] -= s[CORRECTED + i] - ch[BEFORE_CORRECTED + i]
+    else:
+        # Where both would have been at the latest instant that is known outside.
+        at = min(max(ch[E_PUBLISHED], s[T]), s[T] + SMOOTH_REACH)
+        old, new = np.empty(4), np.empty(4)
+        turn = np.empty(3)
+        for i in range(3):
+            turn[i] = ch[BEFORE + 11 + i] * (at - ch[BEFORE])
+        # Exp(world turn) q = q Exp(body turn): conjugate twice instead of a second function
+        for i in range(4):
+            old[i] = ch[BEFORE + 4 + i] if i == 0 else -ch[BEFORE + 4 + i]
+            new[i] = s[Q + i] if i == 0 else -s[Q + i]
+        for i in range(3):
+            turn[i] = -turn[i]
+        _rotate(turn, 0, old, 0)
+        for i in range(3):
+            turn[i] = 0.0 if s[BRIDGING] > 0.0 else -(s[U + i] - s[BG + i]) * (at - s[T])
+        _rotate(turn, 0, new, 0)
+        for i in range(3):
+            old[1 + i] = -old[1 + i]
+            e = ch[BEFORE + 1 + i] + ch[BEFORE + 8 + i] * (at - ch[BEFORE])
+            ch[E + i] += e - s[POS + i] - s[V + i] * (at - s[T])
+        _rotate(ch, E + 3, old, 0)
+        # Exp(E') = Exp(E) old newᵀ; new stands conjugated already
+        w = old[0] * new[0] - old[1] * new[1] - old[2] * new[2] - old[3] * new[3]
+        x = old[0] * new[1] + old[1] * new[0] + old[2] * new[3] - old[3] * new[2]
+        y = old[0] * new[2] - old[1] * new[3] + old[2] * new[0] + old[3] * new[1]
+        z = old[0] * new[3] + old[1] * new[2] - old[2] * new[1] + old[3] * new[0]
+        n = math.sqrt(x * x + y * y + z * z)
+        factor = (2.0 if n < 1e-9 else 2.0 * math.atan2(n, abs(w)) / n) * (-1.0 if w < 0.0 else 1.0)
+        ch[E + 3], ch[E + 4], ch[E + 5] = factor * x, factor * y, factor * z
+    far = math.sqrt(ch[E] ** 2 + ch[E + 1] ** 2 + ch[E + 2] ** 2) > SMOOTH_DISTANCE
+    turned = math.sqrt(ch[E + 3] ** 2 + ch[E + 4] ** 2 + ch[E + 5] ** 2) > SMOOTH_ANGLE
+    if far or turned or s[RESET_ID] != ch[E_RESET_ID]:
+        ch[E_RESETS] += 1.0
+        ch[E_RESET_ID] = s[RESET_ID]
+        for i in range(6):
+            ch[E_STEP + i] = -ch[E + i]
+            ch[E + i] = 0.0
+
+
+# ----------------------------------------------------------------------------------------------- called from Python
+
+FEED_SAMPLES, FEED_FIX, POSE_AT = range(3)
+BEST, SMOOTH = 0, 1
+
+
+@_jit
+def process(memory, task, channel, t, inputs, outputs):
     """The one entry into compiled code: each further one would cost seconds of compilation.
 
+    `channel` of the poses given out: BEST or SMOOTH.
     FEED_SAMPLES: `inputs` (n, 7) are IMU samples; into `outputs` (n, 8), or (0, 8), goes the newest pose after each:
     its instant, which is the sample's stamp unless that came late, position, quaternion wxyz, NaN before the start.
     -> number of samples kept.
@@ -1122,9 +1240,11 @@ def process(memory, task, t, inputs, outputs):
     a = META
     b = a + PARAMS
     c = b + STATE
+    ch = memory[c : c + CHANNEL]
+    c += CHANNEL
     d = c + IMU_CAPACITY * 7
     e = d + FIX_CAPACITY * FIX
-    meta, prm, state = memory[:a], memory[a:b], memory[b:c]
+    meta, prm, state = memory[:a], memory[a:b], memory[b : c - CHANNEL]
     imu = memory[c:d].reshape((IMU_CAPACITY, 7))
     fixes = memory[d:e].reshape((FIX_CAPACITY, FIX))
     checkpoints = memory[e:].reshape((CP_CAPACITY, STATE))
@@ -1148,18 +1268,36 @@ def process(memory, task, t, inputs, outputs):
         else:
             return 0
     for i in range(inputs.shape[0] if live else 1):
+        started = state[INITIALISED] > 0.0
+        rewinds, cursor = meta[REWINDS], state[FIX_CURSOR]
+        if live and started:
+            ch[BEFORE] = state[T]
+            for j in range(3):
+                ch[BEFORE + 1 + j] = state[POS + j]
+                ch[BEFORE + 8 + j] = state[V + j]
+                ch[BEFORE + 11 + j] = 0.0 if state[BRIDGING] > 0.0 else state[U + j] - state[BG + j]
+            for j in range(4):
+                ch[BEFORE + 4 + j] = state[Q + j]
+            for j in range(6):
+                ch[BEFORE_CORRECTED + j] = state[CORRECTED + j]
         if task == FEED_SAMPLES:
             if _insert_sample(state, prm, imu, checkpoints, meta, inputs, i):
                 answer += 1
         elif task == FEED_FIX:
             answer = _insert_fix(state, prm, fixes, checkpoints, meta, inputs[i])
         _advance(s, prm, imu, fixes, checkpoints, meta, until, live)
+        if live and started:
+            _absorb(state, ch, meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor)
+        elif live:
+            ch[E_T] = state[T]
         if task == FEED_SAMPLES and i < outputs.shape[0]:
             outputs[i, 0] = s[T]
             for j in range(3):
                 outputs[i, 1 + j] = s[POS + j] if s[INITIALISED] > 0.0 else math.nan
             for j in range(4):
                 outputs[i, 4 + j] = s[Q + j] if s[INITIALISED] > 0.0 else math.nan
+            if channel == SMOOTH:
+                _move(outputs[i], 1, 4, ch, 0.0)
     if live:
         return answer
     # On from the last sample: between two samples as ever; beyond them with the last input as long as it is fresh,
@@ -1174,21 +1312,35 @@ def process(memory, task, t, inputs, outputs):
         else:
             s[NEXT_T] = math.inf
             s[NEXT_U : NEXT_U + 6] = s[U : U + 6]
-            t_leg = t if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
+            # Later than that nothing is known, and the pose stays where it was.
+            t_leg = min(t, s[T] + SPEED_TIME) if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
         if t_leg > s[T] and s[INITIALISED] + fix_end > 0.0:
             if not between:
                 s[BRIDGING] = leg
             _run_to(s, prm, fixes, fix_end, t_leg)
     if not s[INITIALISED] > 0.0:
         return 0
-    _write_pose(s, outputs[0])
+    out = outputs[0]
+    _write_pose(s, out)
+    if channel == SMOOTH:
+        out[P_RESET_ID] = ch[E_RESETS]
+        for i in range(6):
+            out[P_STEP + i] = ch[E_STEP + i]
+        if t >= state[T]:
+            ch[E_PUBLISHED] = max(ch[E_PUBLISHED], t)
+            _move(out, P_POS, P_QUAT, ch, t - ch[E_T])
+            # E is known, and not the filter's error: what is left of it adds to the second moment.
+            left = _left(ch, t - ch[E_T])
+            for i in range(6):
+                for j in range(6):
+                    out[P_COV + 6 * i + j] += left[i // 3] * left[j // 3] * ch[E + i] * ch[E + j]
     return 1
 
 
 def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Meta, parameters, state, IMU ring, fix ring and checkpoint ring of one robot's memory, as `process` sees them."""
-    sizes = (META, PARAMS, STATE, IMU_CAPACITY * 7, FIX_CAPACITY * FIX, CP_CAPACITY * STATE)
-    meta, prm, state, imu, fixes, checkpoints = np.split(memory, np.cumsum(sizes)[:-1])
+    sizes = (META, PARAMS, STATE, CHANNEL, IMU_CAPACITY * 7, FIX_CAPACITY * FIX, CP_CAPACITY * STATE)
+    meta, prm, state, _, imu, fixes, checkpoints = np.split(memory, np.cumsum(sizes)[:-1])
     return (
         meta,
         prm,
@@ -1201,7 +1353,7 @@ def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
 
 def new_memory(parameters: Array) -> Array:
     """The memory of a robot that nothing is known of: empty rings, a blank state, and a checkpoint of it."""
-    memory = np.zeros(META + PARAMS + STATE + IMU_CAPACITY * 7 + FIX_CAPACITY * FIX + CP_CAPACITY * STATE)
+    memory = np.zeros(META + PARAMS + STATE + CHANNEL + IMU_CAPACITY * 7 + FIX_CAPACITY * FIX + CP_CAPACITY * STATE)
     meta, prm, state, _, _, checkpoints = views(memory)
     prm[:] = parameters
     meta[HORIZON] = state[T] = state[T_IMU] = state[T_ACCEPTED] = -math.inf

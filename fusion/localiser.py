@@ -9,17 +9,17 @@ import numpy as np
 
 from fusion import kernels as k
 from fusion.measurements import Array, FixOutcome, ImuBatch, Mode, Outcome, Pose, PoseFix
-from fusion.params import Engine, FilterParams, Motion
+from fusion.params import Channel, Engine, FilterParams, Motion
 from fusion.timeline import Timeline, fix_row
 
 
 class _Timeline(Protocol):
     @property
     def state(self) -> Array: ...
-    def feed_samples(self, samples: Array, track: Array | None = None) -> int: ...
+    def feed_samples(self, samples: Array, track: Array | None = None, channel: Channel = "best") -> int: ...
     def feed_fix(self, row: Array) -> int: ...
     def judged(self) -> list[Array]: ...
-    def pose_at(self, t: float) -> Array | None: ...
+    def pose_at(self, t: float, channel: Channel = "best") -> Array | None: ...
     @property
     def figures(self) -> dict[str, int]: ...
 
@@ -65,7 +65,9 @@ class Localiser:
         self._samples = 0
         self._sources: dict[tuple[float, float], str] = {}
 
-    def feed(self, measurement: ImuBatch | PoseFix, track: Array | None = None) -> list[FixOutcome]:
+    def feed(
+        self, measurement: ImuBatch | PoseFix, track: Array | None = None, channel: Channel = "best"
+    ) -> list[FixOutcome]:
         """Take a measurement. -> the fixes that were judged by this call.
 
         That is usually the fix just fed, or none; a fix stamped later than all IMU data so far is judged when they
@@ -73,7 +75,7 @@ class Localiser:
         `track`: see `feed_samples`, for a batch of IMU samples.
         """
         if isinstance(measurement, ImuBatch):
-            self.feed_samples(measurement.samples, track)
+            self.feed_samples(measurement.samples, track, channel)
         else:
             status = self._timeline.feed_fix(fix_row(measurement))
             if status != k.PENDING:
@@ -83,14 +85,14 @@ class Localiser:
             self._sources[measurement.t, measurement.arrival] = measurement.source
         return self.judged()
 
-    def feed_samples(self, samples: Array, track: Array | None = None) -> None:
+    def feed_samples(self, samples: Array, track: Array | None = None, channel: Channel = "best") -> None:
         """IMU samples (n, 7) as in `ImuBatch`, unchecked.
 
         `track` (n, 8) receives the newest pose as it is known when each sample has arrived: its instant (the sample's
         stamp, unless that came late), position, quaternion wxyz; NaN before the first fix.
         """
         self._samples += len(samples)
-        self._timeline.feed_samples(samples, track)
+        self._timeline.feed_samples(samples, track, channel)
 
     def judged(self) -> list[FixOutcome]:
         """The fixes judged since this was last asked; `feed` asks by itself."""
@@ -188,12 +190,15 @@ class Localiser:
         sigma: Array = np.sqrt(np.diag(self._covariance)[first : first + n])
         return sigma
 
-    def pose_at(self, t: float) -> Pose | None:
+    def pose_at(self, t: float, channel: Channel = "best") -> Pose | None:
         """The pose at instant t: of the past as far as the buffer reaches, or extrapolated into the near future.
 
-        None before the first fix and before the buffer.
+        None before the first fix and before the buffer. `channel`: "best" is the filter's estimate, which steps with
+        every correction. "smooth" is for steering: it glides to the best one at no more than 0.3 m/s and 60 deg/s, and
+        steps only beyond 0.25 m or 20 deg and when the filter starts anew, which `reset_id` and `reset_step` tell. Of
+        the past it is the best.
         """
-        row = self._timeline.pose_at(t)
+        row = self._timeline.pose_at(t, channel)
         if row is None:
             return None
         covariance = row[k.P_COV : k.P_COV + 36].reshape(6, 6)
@@ -210,6 +215,7 @@ class Localiser:
             mode=self._mode(fix_age, t - float(row[k.P_T_IMU]), covariance),
             reset_id=int(row[k.P_RESET_ID]),
             fix_age=fix_age,
+            reset_step=row[k.P_STEP : k.P_STEP + 6],
         )
 
     def _mode(self, fix_age: float, imu_age: float, covariance: Array) -> Mode:

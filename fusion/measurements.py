@@ -140,6 +140,7 @@ class Pose:
     `angular_velocity`: (3,) rad/s, body. `covariance`: (6, 6), see the module. `velocity_covariance`: (3, 3), world.
     `reset_id` rises by one whenever the pose was set anew instead of corrected.
     `fix_age`: s from the last accepted fix's capture to `t`; inf before the first.
+    `reset_step`: (6,) by how much the smooth channel stepped at its last reset, m and rad, world axes.
     """
 
     robot: str
@@ -153,6 +154,7 @@ class Pose:
     mode: Mode
     reset_id: int
     fix_age: float
+    reset_step: Array = field(default_factory=lambda: np.zeros(6))
 
     @property
     def yaw(self) -> float:

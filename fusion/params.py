@@ -11,6 +11,7 @@ from msgspec import Meta, Struct
 
 Motion = Literal["free", "ground", "differential"]
 Engine = Literal["numba", "filterpy"]
+Channel = Literal["best", "smooth"]
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]

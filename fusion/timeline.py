@@ -10,8 +10,9 @@ import numpy as np
 
 from fusion import kernels as k
 from fusion.measurements import Array, PoseFix
-from fusion.params import FilterParams, Motion
+from fusion.params import Channel, FilterParams, Motion
 
+CHANNELS: dict[Channel, int] = {"best": k.BEST, "smooth": k.SMOOTH}
 MOTIONS: dict[Motion, float] = {"free": k.FREE, "ground": k.GROUND, "differential": k.DIFFERENTIAL}
 
 
@@ -54,18 +55,18 @@ class Timeline:
         """(kernels.STATE,): the live filter, a view."""
         return self._state
 
-    def feed_samples(self, samples: Array, track: Array | None = None) -> int:
+    def feed_samples(self, samples: Array, track: Array | None = None, channel: Channel = "best") -> int:
         """IMU samples (n, 7): t, gyro, accel. -> how many were neither duplicates nor older than the buffer.
 
         `track` (n, 8) receives the newest pose after each sample: its instant (the sample's stamp, unless that came
         late), position, quaternion wxyz; NaN before the first fix.
         """
         outputs = self._nothing if track is None else track
-        return int(k.process(self._memory, k.FEED_SAMPLES, 0.0, samples, outputs))
+        return int(k.process(self._memory, k.FEED_SAMPLES, CHANNELS[channel], 0.0, samples, outputs))
 
     def feed_fix(self, row: Array) -> int:
         """A fix as `fix_row` makes it. -> `kernels.PENDING`, `TOO_LATE` or `DUPLICATE`."""
-        status = int(k.process(self._memory, k.FEED_FIX, 0.0, row[np.newaxis], self._nothing))
+        status = int(k.process(self._memory, k.FEED_FIX, k.BEST, 0.0, row[np.newaxis], self._nothing))
         if status == k.PENDING:
             self._waiting += 1
         return status
@@ -85,10 +86,10 @@ class Timeline:
         self._waiting -= len(rows)
         return rows
 
-    def pose_at(self, t: float) -> Array | None:
+    def pose_at(self, t: float, channel: Channel = "best") -> Array | None:
         """A pose (kernels.POSE,) for instant t; None before the first fix, or before the buffer."""
         out = np.empty((1, k.POSE))
-        return out[0] if k.process(self._memory, k.POSE_AT, t, self._nothing, out) else None
+        return out[0] if k.process(self._memory, k.POSE_AT, CHANNELS[channel], t, self._nothing, out) else None
 
     @property
     def figures(self) -> dict[str, int]:
