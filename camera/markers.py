@@ -101,10 +101,12 @@ class _Pass:
 
 
 # The cheap ones first. One window is enough for a sharp, well-lit marker, half the resolution for one of 40 px or more.
+# A quarter finds large markers under strong blur, equalised contrast those in the dark, enlargement the small ones.
 _PASSES = (
     _Pass(0.5, windows=(13, 13, 10)),
     _Pass(windows=(13, 13, 10)),
     _Pass(0.5, equalise=True, windows=(13, 13, 10)),
+    _Pass(0.25),
     _Pass(),
     _Pass(equalise=True),
     _Pass(2.0, windows=(5, 45, 20)),
@@ -402,7 +404,7 @@ def refine_corners(image: Image, corners_px: Array, cells: int) -> tuple[Array, 
     start = np.asarray(corners_px, dtype=np.float64)
     cell = np.maximum(_shortest_sides(start) / cells, 1e-9)
     # Half a profile stays within the black border inside and the white margin outside, each a cell wide.
-    reach = np.clip(0.8 * cell, 1.5, 12.0)
+    reach = np.maximum(0.8 * cell, 1.5)
     corners, _, blur, clear = _refine_once(image, start, reach)
     # Again: the detector's corners may be off by pixels, and a profile that is not centred pulls its edge to its own
     # middle. Three sigma of the edge's own blur hold all of it, and a shorter profile is sampled more finely.
@@ -428,7 +430,7 @@ def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Arr
     # Out of the square, whose corners run clockwise in an image with y down: left of the one leg, right of the other.
     outward = np.stack([along[..., 1], -along[..., 0]], axis=-1) * np.array([1.0, -1.0])[:, None]
 
-    gap = np.minimum(_GAP * length, _GAP_PX)
+    gap = np.minimum(_GAP * length, np.maximum(_GAP_PX, 0.7 * reach)[:, None, None])
     u = gap[..., None] + np.minimum(length - 2.0 * gap, _LEG_PX)[..., None] * np.linspace(0.0, 1.0, _PROFILES)
     across = np.linspace(-1.0, 1.0, _SAMPLES)
     on_leg = corners[:, :, None, None] + u[..., None] * along[..., None, :]
