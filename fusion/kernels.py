@@ -1170,19 +1170,18 @@ def _move(out, position, quaternion, ch, dt):
 @_jit
 def _absorb(s, ch, plain):
     """Set E such that the smooth pose does not move by what an input has done to the filter's."""
-    dt = s[T] - ch[E_T]
-    if dt > 0.0:
-        left = _left(ch, dt)
+    # Where both would have been at the latest instant that is known outside.
+    at = s[T] if plain else min(max(ch[E_PUBLISHED], s[T]), s[T] + SMOOTH_REACH)
+    if at > ch[E_T]:
+        left = _left(ch, at - ch[E_T])
         for i in range(6):
             ch[E + i] *= left[i // 3]
-        ch[E_T] = s[T]
+        ch[E_T] = at
     if plain:
         # only pseudo-measurements, and the motion itself, which is none of E's business
         for i in range(6):
             ch[E + i] -= s[CORRECTED + i] - ch[BEFORE_CORRECTED + i]
     else:
-        # Where both would have been at the latest instant that is known outside.
-        at = min(max(ch[E_PUBLISHED], s[T]), s[T] + SMOOTH_REACH)
         old, new = np.empty(4), np.empty(4)
         turn = np.empty(3)
         for i in range(3):
@@ -1337,14 +1336,15 @@ def process(memory, task, channel, t, inputs, outputs):
     return 1
 
 
-def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Meta, parameters, state, IMU ring, fix ring and checkpoint ring of one robot's memory, as `process` sees them."""
+def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    """Meta, parameters, state, smooth channel, IMU ring, fix ring and checkpoint ring of one robot's memory."""
     sizes = (META, PARAMS, STATE, CHANNEL, IMU_CAPACITY * 7, FIX_CAPACITY * FIX, CP_CAPACITY * STATE)
-    meta, prm, state, _, imu, fixes, checkpoints = np.split(memory, np.cumsum(sizes)[:-1])
+    meta, prm, state, channel, imu, fixes, checkpoints = np.split(memory, np.cumsum(sizes)[:-1])
     return (
         meta,
         prm,
         state,
+        channel,
         imu.reshape(IMU_CAPACITY, 7),
         fixes.reshape(FIX_CAPACITY, FIX),
         checkpoints.reshape(CP_CAPACITY, STATE),
@@ -1354,9 +1354,10 @@ def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
 def new_memory(parameters: Array) -> Array:
     """The memory of a robot that nothing is known of: empty rings, a blank state, and a checkpoint of it."""
     memory = np.zeros(META + PARAMS + STATE + CHANNEL + IMU_CAPACITY * 7 + FIX_CAPACITY * FIX + CP_CAPACITY * STATE)
-    meta, prm, state, _, _, checkpoints = views(memory)
+    meta, prm, state, channel, _, _, checkpoints = views(memory)
     prm[:] = parameters
     meta[HORIZON] = state[T] = state[T_IMU] = state[T_ACCEPTED] = -math.inf
+    channel[E_PUBLISHED] = -math.inf
     state[STILL_SINCE] = math.inf
     state[STILL_BARRED] = -math.inf
     state[SCALE : SCALE + 4] = 1.0

@@ -17,7 +17,9 @@ from filterpy.kalman import ExtendedKalmanFilter
 from fusion import kernels as k
 from fusion.geometry import exp_so3, log_so3, quaternion_from_rotation, rotation_from_quaternion, skew
 from fusion.measurements import Array
-from fusion.params import GRAVITY, FilterParams, Motion
+from fusion.params import GRAVITY, Channel, FilterParams, Motion
+from fusion.smoothing import Motion as Moving
+from fusion.smoothing import Smoother
 
 TH, DV, DP, DBG, DBA, DTD, DTILT = (
     slice(0, 3),
@@ -53,6 +55,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.accel_bias = np.zeros(3)
         self.time_offset = 0.0
         self.tilt = np.zeros(2)
+        self.corrected = np.zeros(6)  # sum of all moves by updates: position, rotation vector, world axes
 
     def predict_x(self, u: Any = 0) -> None:
         """The error stays zero; `move` carries the nominal state."""
@@ -101,6 +104,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.update(y, lambda _: H, _no_innovation, R=R)
         dx = self.x
         self.x = np.zeros(N)
+        self.corrected = self.corrected + np.concatenate([self.rotation @ dx[DP], self.rotation @ dx[TH]])
         self.velocity = self.velocity + self.rotation @ dx[DV]
         self.position = self.position + self.rotation @ dx[DP]
         self.gyro_bias = self.gyro_bias + dx[DBG]
@@ -208,6 +212,7 @@ class ReferenceTimeline:
         self._horizon = -math.inf
         self._figures = {"imu_duplicates": 0, "imu_late": 0, "rewinds": 0}
         self._waiting = 0
+        self._smoother = Smoother()
 
     # --- the interface of Timeline
 
@@ -233,18 +238,21 @@ class ReferenceTimeline:
         vector[k.INITIALISED], vector[k.RESET_ID] = s.initialised, s.reset_id
         return vector
 
-    def feed_samples(self, samples: Array, track: Array | None = None) -> int:
+    def feed_samples(self, samples: Array, track: Array | None = None, channel: Channel = "best") -> int:
         """See `Timeline.feed_samples`."""
         kept = 0
         for i, row in enumerate(samples.tolist()):
+            before = self._before()
             kept += self._insert_sample(tuple(row))
             self._advance(self._state, math.inf, live=True)
+            self._absorb(before)
             if track is not None:
                 track[i] = np.nan
                 track[i, 0] = self._state.t
                 if self._state.initialised:
-                    track[i, 1:4] = self._state.main.position
-                    track[i, 4:8] = quaternion_from_rotation(self._state.main.rotation)
+                    e = self._smoother.offset(self._state.t) if channel == "smooth" else np.zeros(6)
+                    track[i, 1:4] = self._state.main.position + e[:3]
+                    track[i, 4:8] = quaternion_from_rotation(exp_so3(e[3:]) @ self._state.main.rotation)
         return kept
 
     def feed_fix(self, row: Array) -> int:
@@ -254,6 +262,7 @@ class ReferenceTimeline:
         if place < len(self._fixes) and self._fix_key(self._fixes[place]) == key:
             return k.DUPLICATE
         t = float(row[k.F_T])
+        before = self._before()
         if not self._precedes_fix(self._state, t, place) and not self._rewind(
             t, lambda state: self._precedes_fix(state, t, place)
         ):
@@ -262,6 +271,7 @@ class ReferenceTimeline:
         self._waiting += 1
         self._horizon = max(self._horizon, t)
         self._advance(self._state, math.inf, live=True)
+        self._absorb(before)
         self._forget()
         return k.PENDING
 
@@ -275,7 +285,25 @@ class ReferenceTimeline:
         self._waiting -= len(rows)
         return rows
 
-    def pose_at(self, t: float) -> Array | None:
+    def _before(self) -> tuple[bool, int, int, Array, Moving]:
+        """What must be known of the state before an input, to smooth what it does."""
+        s = self._state
+        return s.initialised, self._figures["rewinds"], s.fix_cursor, s.main.corrected, self._moving()
+
+    def _moving(self) -> Moving:
+        s = self._state
+        rate = np.zeros(3) if s.bridging else s.u[:3] - s.main.gyro_bias
+        return Moving(s.t, s.main.position, s.main.rotation, s.main.velocity, rate, s.reset_id)
+
+    def _absorb(self, before: tuple[bool, int, int, Array, Moving]) -> None:
+        started, rewinds, cursor, corrected, moving = before
+        if not started:
+            self._smoother.start(self._state.t)
+            return
+        plain = self._figures["rewinds"] == rewinds and self._state.fix_cursor == cursor
+        self._smoother.absorb(moving, self._moving(), self._state.main.corrected - corrected if plain else None)
+
+    def pose_at(self, t: float, channel: Channel = "best") -> Array | None:
         """See `Timeline.pose_at`."""
         fixes = self._fixes
         if t >= self._state.t:
@@ -293,13 +321,22 @@ class ReferenceTimeline:
         elif state.initialised or fixes:
             state.next_t, state.next_u = math.inf, state.u
             fresh = min(t, state.t_imu + self._params.imu_gap)
-            for bridging, leg in ((False, fresh), (True, t)):
+            # Later than that nothing is known, and the pose stays where it was.
+            for bridging, leg in ((False, fresh), (True, min(t, max(fresh, state.t) + k.SPEED_TIME))):
                 if leg > state.t:
                     state.bridging = bridging
                     self._run_to(state, leg, fixes)
         if not state.initialised:
             return None
-        return self._pose(state)
+        out = self._pose(state)
+        if channel == "smooth":
+            out[k.P_RESET_ID], out[k.P_STEP : k.P_STEP + 6] = self._smoother.resets, self._smoother.step
+            if t >= self._state.t:
+                e = self._smoother.publish(t)
+                out[k.P_POS : k.P_POS + 3] += e[:3]
+                out[k.P_QUAT : k.P_QUAT + 4] = quaternion_from_rotation(exp_so3(e[3:]) @ state.main.rotation)
+                out[k.P_COV : k.P_COV + 36] += np.outer(e, e).ravel()
+        return out
 
     # --- the timeline
 
@@ -500,12 +537,14 @@ class ReferenceTimeline:
         before, state.last_innovation = state.last_innovation, e
         state.excess, state.scale = state.excess.copy(), state.scale.copy()
         for block, half in enumerate((slice(0, 3), slice(3, 6))):
-            d2 = e[half] @ e[half]
-            follows = (e[half] @ before[half]) / (math.sqrt(d2 * (before[half] @ before[half])) + 1.0)
+            d2 = float(e[half] @ e[half])
+            length = float(before[half] @ before[half])
+            follows = float(e[half] @ before[half]) / (math.sqrt(d2 * length) + 1.0)
             more = min(d2 / 3.0 - 1.0, most)
             to_process = min(max(0.5 + follows, 0.0), 1.0)
             for i, part in ((block, to_process), (block + 2, 1.0 - to_process)):
-                state.excess[i] = min(max(state.excess[i] + self._params.adaptation * part * more, -1.0), 8.0)
+                excess = float(state.excess[i]) + self._params.adaptation * part * more
+                state.excess[i] = min(max(excess, -1.0), 8.0)
                 factor = math.exp(max(state.excess[i] - 0.7, 0.0))
                 state.scale[i] = math.sqrt(factor) if i < 2 else factor
 
@@ -519,7 +558,7 @@ class ReferenceTimeline:
             state.still_fixes = n = state.still_fixes + 1
             share = p.fix_correlation
             if n > 1 and share > 0.0:
-                one, two = (share + (1.0 - share) / i for i in (n - 1, n))
+                one, two = share + (1.0 - share) / (n - 1), share + (1.0 - share) / n
                 more = one * two / (one - two) - 1.0
                 S, R = S + more * R, R + more * R
         if fix[k.F_D2_POSITION] > k.LEAVE_STILL:
@@ -623,7 +662,7 @@ class ReferenceTimeline:
         still = state.still_since <= state.t - k.STILL_AFTER * (1.0 if state.still_sure else 2.0)
 
         def loosened(sigma: float, i: int, y: float) -> float:
-            return max(sigma**2 * max(state.constraint_nis[i], 1.0), y * y)
+            return max(sigma**2 * max(float(state.constraint_nis[i]), 1.0), float(y * y))
 
         body = f.rotation.T @ f.velocity
         H = np.zeros((9, N))
@@ -656,7 +695,7 @@ class ReferenceTimeline:
 
     def _pose(self, state: _State) -> Array:
         f = state.main
-        out = np.empty(k.POSE)
+        out = np.zeros(k.POSE)
         out[k.P_T] = state.t
         out[k.P_POS : k.P_POS + 3] = f.position
         out[k.P_QUAT : k.P_QUAT + 4] = quaternion_from_rotation(f.rotation)

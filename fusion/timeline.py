@@ -46,7 +46,7 @@ class Timeline:
 
     def __init__(self, params: FilterParams, motion: Motion) -> None:
         self._memory = k.new_memory(parameter_vector(params, motion))
-        self._meta, _, self._state, _, self._fixes, _ = k.views(self._memory)
+        self._meta, _, self._state, _, _, self._fixes, _ = k.views(self._memory)
         self._nothing = np.zeros((0, 8))
         self._waiting = 0  # fixes in the ring whose outcome has not been told
 
@@ -88,7 +88,7 @@ class Timeline:
 
     def pose_at(self, t: float, channel: Channel = "best") -> Array | None:
         """A pose (kernels.POSE,) for instant t; None before the first fix, or before the buffer."""
-        out = np.empty((1, k.POSE))
+        out = np.zeros((1, k.POSE))
         return out[0] if k.process(self._memory, k.POSE_AT, CHANNELS[channel], t, self._nothing, out) else None
 
     @property

@@ -233,3 +233,50 @@ def test_parameters_reach_the_filter():
     strict = Drive(Localiser("rover", FilterParams(gate=1e-6, gate_block=1e-6, gate_inflation=1.0)))
     strict.on(3.0)
     assert strict.outcomes[1].outcome is Outcome.REJECTED
+
+
+def test_the_smooth_channel_does_not_jump():
+    """Between samples it moves as the robot does, within the promised speed; the best one jumps with each fix."""
+    worst = {}
+    for channel in ("best", "smooth"):
+        rng = np.random.default_rng(3)
+        localiser = Localiser("rover")
+        tracks = []
+        for i in range(40):
+            stamps = 0.5 * i + np.arange(50) * 0.01
+            tracks.append(np.empty((50, 8)))
+            localiser.feed_samples(circle.imu(stamps, rng), tracks[-1], channel)
+            localiser.feed(circle.fix(stamps[-1] - 0.2, 0.2, rng))
+        track = np.concatenate(tracks)[300:]
+        true = np.array([circle.pose(t)[0] for t in track[:, 0]])
+        worst[channel] = np.linalg.norm(np.diff(track[:, 1:4] - true, axis=0), axis=1).max()
+    # 0.3 m/s for 10 ms, and the filter's own error of the speed
+    assert worst["smooth"] < 0.003 + 0.1 * 0.01
+    assert worst["best"] > 3.0 * worst["smooth"]
+
+
+def test_the_smooth_channel_steps_when_it_must_and_says_so(drive):
+    drive.on(10.0)
+    away = np.array([2.0, -1.0, 0.0])
+    before = drive.localiser.pose_at(drive.t, "smooth")
+    drive.on(1.5, offset=away)
+    after = drive.localiser.pose_at(drive.t, "smooth")
+    assert after.reset_id == before.reset_id + 1
+    np.testing.assert_allclose(after.reset_step[:3], away, atol=0.3)
+    np.testing.assert_allclose(after.position, drive.localiser.latest.position, atol=0.05)
+
+
+def test_the_smooth_channel_is_continuous_where_it_was_published(drive):
+    """A pose is asked for 50 ms ahead of the IMU; then a fix comes, which moves the best one."""
+    drive.on(3.0)
+    worst = {"best": 0.0, "smooth": 0.0}
+    for _ in range(20):
+        drive.imu(0.3)
+        now = drive.t + 0.05
+        before = {channel: drive.localiser.pose_at(now, channel) for channel in worst}
+        drive.localiser.feed(circle.fix(drive.t - 0.2, 0.25, drive.rng))
+        for channel, pose in before.items():
+            step = np.linalg.norm(drive.localiser.pose_at(now, channel).position - pose.position)
+            worst[channel] = max(worst[channel], step)
+    assert worst["smooth"] < 0.001
+    assert worst["best"] > 0.005

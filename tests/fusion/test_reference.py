@@ -64,25 +64,29 @@ def test_kernels_equal_filterpy(motion, seed):
             np.testing.assert_allclose(a, b, atol=1e-9)
     assert {"INITIALISED", "ACCEPTED", "REJECTED", "REINITIALISED"} <= seen
     assert engines[0].counts == engines[1].counts
-    for t in (7.77, 8.9, 9.99, 10.05, 10.7):
-        a, b = (engine.pose_at(t) for engine in engines)
+    instants = [(7.77, "best"), (8.9, "best"), (9.99, "best"), (10.05, "best"), (10.7, "best"), (30.0, "best")]
+    for t, channel in [*instants, (9.0, "smooth"), (9.99, "smooth"), (10.05, "smooth"), (10.7, "smooth")]:
+        a, b = (engine.pose_at(t, channel) for engine in engines)
         np.testing.assert_allclose(a.position, b.position, atol=1e-9)
         assert abs(a.quaternion_wxyz @ b.quaternion_wxyz) == pytest.approx(1.0, abs=1e-15)
         np.testing.assert_allclose(a.velocity, b.velocity, atol=1e-9)
         np.testing.assert_allclose(a.covariance, b.covariance, atol=1e-9)
         np.testing.assert_allclose(a.velocity_covariance, b.velocity_covariance, atol=1e-9)
         assert (a.mode, a.reset_id) == (b.mode, b.reset_id)
+        np.testing.assert_allclose(a.reset_step, b.reset_step, atol=1e-9)
         assert a.fix_age == pytest.approx(b.fix_age, abs=1e-9)
 
 
-def test_the_track_is_the_same():
+@pytest.mark.parametrize("channel", ["best", "smooth"])
+def test_the_track_is_the_same(channel):
     tracks = []
     for engine in ("numba", "filterpy"):
         localiser = Localiser("rover", FilterParams(), "ground", engine)
         parts = []
         for measurement in inputs(2):
             track = np.full((len(measurement.samples), 8), np.nan) if isinstance(measurement, ImuBatch) else None
-            localiser.feed(measurement, track)
+            localiser.feed(measurement, track, channel)
+            localiser.pose_at(9.0, channel)  # that something is published changes what is smoothed
             parts += [] if track is None else [track]
         tracks.append(np.concatenate(parts))
     assert np.isfinite(tracks[0][:, 1]).sum() > 900

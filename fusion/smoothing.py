@@ -1,0 +1,94 @@
+"""The jump-free pose that robots steer by, for the engine without a compiler: what `fusion.kernels` does with E.
+
+The smooth pose is the filter's moved by E = (position, rotation), world axes. A correction sets E such that the pose
+does not move; E then decays with a time constant of 0.1 s, at 0.3 m/s and 60 deg/s at most. Beyond 0.25 m or 20 deg,
+and when the filter starts anew, the pose steps and counts a reset.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fusion import kernels as k
+from fusion.geometry import exp_so3, log_so3
+from fusion.measurements import Array
+
+
+class Motion(NamedTuple):
+    """Where a filter is and how it moves: t, position, rotation (3, 3), velocity (world), rate (body), its reset_id."""
+
+    t: float
+    position: Array
+    rotation: Array
+    velocity: Array
+    rate: Array
+    reset_id: int
+
+    def at(self, t: float) -> tuple[Array, Array]:
+        """Position and rotation at t, straight on."""
+        dt = t - self.t
+        return self.position + self.velocity * dt, self.rotation @ exp_so3(self.rate * dt)
+
+
+class Smoother:
+    """E, and what has been published of it."""
+
+    def __init__(self) -> None:
+        self._e = np.zeros(6)
+        self._t = -math.inf
+        self._published = -math.inf
+        self._reset_id = 0
+        self.resets = 0
+        self.step = np.zeros(6)
+
+    def start(self, t: float) -> None:
+        """Before the first fix there is nothing to smooth."""
+        self._t = t
+
+    def _left(self, dt: float) -> Array:
+        left = np.ones(2)
+        if dt <= 0.0:
+            return left
+        for i, most in enumerate((k.SMOOTH_SPEED, k.SMOOTH_RATE)):
+            size = float(np.linalg.norm(self._e[3 * i : 3 * i + 3]))
+            if size > 0.0:
+                left[i] = 1.0 - min(1.0 - math.exp(-dt / k.SMOOTH_TIME), most * dt / size)
+        return left
+
+    def offset(self, t: float) -> Array:
+        """(6,): what is left of E at t."""
+        offset: Array = self._e * np.repeat(self._left(t - self._t), 3)
+        return offset
+
+    def publish(self, t: float) -> Array:
+        """`offset`, and from now on the pose at t is kept from moving."""
+        self._published = max(self._published, t)
+        return self.offset(t)
+
+    def absorb(self, before: Motion, after: Motion, corrected: Array | None) -> None:
+        """Take what an input has done to the filter's pose into E.
+
+        `corrected` (6,): the sum of the moves by pseudo-measurements, where that is all that happened; None where the
+        past was done again or a fix was taken.
+        """
+        at = after.t
+        if corrected is None:
+            at = min(max(self._published, after.t), after.t + k.SMOOTH_REACH)
+        if at > self._t:
+            self._e = self.offset(at)
+            self._t = at
+        if corrected is not None:
+            self._e = self._e - corrected
+        else:
+            (old, old_rotation), (new, new_rotation) = before.at(at), after.at(at)
+            turn = log_so3(exp_so3(self._e[3:]) @ old_rotation @ new_rotation.T)
+            self._e = np.concatenate([self._e[:3] + old - new, turn])
+        far = float(np.linalg.norm(self._e[:3])) > k.SMOOTH_DISTANCE
+        turned = float(np.linalg.norm(self._e[3:])) > k.SMOOTH_ANGLE
+        if far or turned or after.reset_id != self._reset_id:
+            self.resets += 1
+            self._reset_id = after.reset_id
+            self.step, self._e = -self._e, np.zeros(6)
