@@ -380,7 +380,7 @@ class Wpilib:
     It wants wheels. Without, their speed is the forward accelerometer's, integrated and held to the way between fixes
     by a small observer of the bias. It knows no gyroscope bias, and is given the one at the start, as if calibrated at
     rest. The gain depends on `ratio` alone, sigma of the fixes over that of the odometry, of position and of heading:
-    the best for these recordings, found by trying.
+    the best on other seeds of the same course.
     """
 
     def __init__(self, simulation: Simulation, wheels: bool, ratio: tuple[float, float]) -> None:
