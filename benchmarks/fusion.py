@@ -193,9 +193,9 @@ ROWS = [
     Row("Stone Soup", peers.stone_soup, "stonesoup", seeds=SLOW_SEEDS),
     Row("gtsam, ISAM2 fixed lag 3 s", peers.FixedLag, "gtsam"),
     Row(
-        "WPILib, speed by IMU and fixes", partial(peers.Wpilib, wheels=False, ratio=(0.2, 16.0)), "wpimath", planar=True
+        "WPILib, speed by IMU and fixes", partial(peers.Wpilib, wheels=False, ratio=(0.2, 10.0)), "wpimath", planar=True
     ),
-    Row("WPILib, with wheels besides", partial(peers.Wpilib, wheels=True, ratio=(1.0, 16.0)), "wpimath", planar=True),
+    Row("WPILib, with wheels besides", partial(peers.Wpilib, wheels=True, ratio=(0.6, 10.0)), "wpimath", planar=True),
     Row("constant velocity, no IMU", peers.constant_velocity, sizes=()),
     Row("holding the last fix", peers.holding, sizes=()),
     Row("gtsam, batch: knows the future", peers.gtsam_batch, "gtsam", sizes=()),

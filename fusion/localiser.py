@@ -183,6 +183,16 @@ class Localiser:
         return self._covariance[k.DTILT : k.DTILT + 2, k.DTILT : k.DTILT + 2].copy()
 
     @property
+    def noise_scale(self) -> Array:
+        """(4,): how much larger than said it has found sigmas: accelerometer, gyroscope, fix position, fix attitude.
+
+        1 where it is not significant. The filterpy engine does not tell: 0.
+        """
+        scale = self._timeline.state[k.SCALE : k.SCALE + 4].copy()
+        scale[2:] = np.sqrt(scale[2:])
+        return scale
+
+    @property
     def _covariance(self) -> Array:
         return self._timeline.state[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
 
