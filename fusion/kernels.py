@@ -142,11 +142,11 @@ HORIZON = 6  # s: newest stamp of any input
 IMU_DUPLICATES, IMU_LATE, REWINDS = 7, 8, 9
 META = 10
 
-IMU_CAPACITY = 4096  # two seconds at 2 kHz
+IMU_CAPACITY = 2048  # two seconds at 1 kHz
 FIX_CAPACITY = 256  # two seconds of four cameras at 30 Hz
-CP_CAPACITY = 64
+CP_CAPACITY = 32
 IMU_MASK, FIX_MASK, CP_MASK = IMU_CAPACITY - 1, FIX_CAPACITY - 1, CP_CAPACITY - 1  # all are powers of two
-CP_PER_BUFFER = 40  # a checkpoint each fortieth of the buffer: 50 ms by default
+CP_PER_BUFFER = 20  # a checkpoint each twentieth of the buffer, 100 ms by default: what is written stays in the cache
 
 # --- A pose as it leaves: t, position, quaternion, velocity, rate, covariance, velocity covariance, bookkeeping ----
 P_T, P_POS, P_QUAT, P_VEL, P_RATE, P_COV, P_VCOV = 0, 1, 4, 8, 11, 14, 50
@@ -170,6 +170,8 @@ GRAVITY_SIGMA = 0.5  # m/s2: how far the mean specific force before the start ma
 UNKNOWN_TILT_SIGMA = math.radians(30.0)  # of a flat marker whose two poses are too close to call
 
 _jit: Any = njit(cache=True, error_model="numpy", nogil=True)
+# For what is called at one place for every sample: a call costs 20 ns or more, since each array is seven arguments.
+_inline: Any = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 
 
 # ------------------------------------------------------------------------------------------------------ rotations
@@ -210,8 +212,8 @@ def _rotation_vector(s, o, r, k, y, at):
 
 
 @_jit
-def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_walk, accel_bias_walk):
-    """Carry the filter at s[o:] over `dt` s of constant angular rate and specific force, both raw.
+def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_walk, accel_bias_walk):
+    """Carry the filter f (BLOCK,) over `dt` s of constant angular rate and specific force, both raw.
 
     With Δv, Δp what specific force adds to velocity and position, in the body axes at the *start*, A = Exp(-ω dt) and
     C = -g dt R̂ᵀ∂u/∂c, u = (c, √(1 - c²)) the vertical, the error goes, up to O(dt²),
@@ -222,10 +224,12 @@ def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias
 
     which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
     A drops out of Q.
+
+    The filter is an array of its own here: with an offset in the index the loops over P are not vectorised (0.37 us).
     """
-    wx, wy, wz = gx - s[o + BG], gy - s[o + BG + 1], gz - s[o + BG + 2]
-    fx, fy, fz = ax - s[o + BA], ay - s[o + BA + 1], az - s[o + BA + 2]
-    qw, qx, qy, qz = s[o], s[o + 1], s[o + 2], s[o + 3]
+    wx, wy, wz = gx - f[BG], gy - f[BG + 1], gz - f[BG + 2]
+    fx, fy, fz = ax - f[BA], ay - f[BA + 1], az - f[BA + 2]
+    qw, qx, qy, qz = f[0], f[1], f[2], f[3]
     # quaternion of half the rotation: cos and sin of a quarter of the angle
     h = 0.5 * dt
     quarter = 0.5 * h * math.sqrt(wx * wx + wy * wy + wz * wz)
@@ -243,18 +247,18 @@ def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias
     r00, r01, r02 = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
     r10, r11, r12 = 2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)
     r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
-    c0, c1 = s[o + TILT], s[o + TILT + 1]
+    c0, c1 = f[TILT], f[TILT + 1]
     g = -GRAVITY * dt
     k0 = r00 * d0 + r01 * d1 + r02 * d2 + g * c0
     k1 = r10 * d0 + r11 * d1 + r12 * d2 + g * c1
     c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
     k2 = r20 * d0 + r21 * d1 + r22 * d2 + g * c2
-    s[o + POS] += (s[o + V] + 0.5 * k0) * dt
-    s[o + POS + 1] += (s[o + V + 1] + 0.5 * k1) * dt
-    s[o + POS + 2] += (s[o + V + 2] + 0.5 * k2) * dt
-    s[o + V] += k0
-    s[o + V + 1] += k1
-    s[o + V + 2] += k2
+    f[POS] += (f[V] + 0.5 * k0) * dt
+    f[POS + 1] += (f[V + 1] + 0.5 * k1) * dt
+    f[POS + 2] += (f[V + 2] + 0.5 * k2) * dt
+    f[V] += k0
+    f[V + 1] += k1
+    f[V + 2] += k2
 
     ew, ex, ey, ez = hw * hw - hx * hx - hy * hy - hz * hz, 2.0 * hw * hx, 2.0 * hw * hy, 2.0 * hw * hz
     nw = qw * ew - qx * ex - qy * ey - qz * ez
@@ -262,7 +266,7 @@ def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias
     ny = qw * ey - qx * ez + qy * ew + qz * ex
     nz = qw * ez + qx * ey - qy * ex + qz * ew
     scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
-    s[o], s[o + 1], s[o + 2], s[o + 3] = nw * scale, nx * scale, ny * scale, nz * scale
+    f[0], f[1], f[2], f[3] = nw * scale, nx * scale, ny * scale, nz * scale
 
     a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
     a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
@@ -270,55 +274,55 @@ def predict(s, o, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias
     t0, t1 = c0 / c2, c1 / c2
     c00, c10, c20 = g * (r00 - t0 * r20), g * (r01 - t0 * r21), g * (r02 - t0 * r22)
     c01, c11, c21 = g * (r10 - t1 * r20), g * (r11 - t1 * r21), g * (r12 - t1 * r22)
-    c = o + COV
+    c = COV
     # F P Fᵀ as F (F P)ᵀ: the same loop twice, over columns that lie side by side in memory. The second round is needed
     # for the first nine columns only, since F leaves the rest alone.
     for second in range(2):
         for j in range(N - 9 * second):
-            t0, t1, t2 = s[c + j], s[c + 18 + j], s[c + 36 + j]
-            v0, v1, v2 = s[c + 54 + j], s[c + 72 + j], s[c + 90 + j]
-            p0, p1, p2 = s[c + 108 + j], s[c + 126 + j], s[c + 144 + j]
-            e0, e1 = s[c + 288 + j], s[c + 306 + j]
-            u0 = d2 * t1 - d1 * t2 - dt * s[c + 216 + j] + c00 * e0 + c01 * e1
-            u1 = d0 * t2 - d2 * t0 - dt * s[c + 234 + j] + c10 * e0 + c11 * e1
-            u2 = d1 * t0 - d0 * t1 - dt * s[c + 252 + j] + c20 * e0 + c21 * e1
+            t0, t1, t2 = f[c + j], f[c + 18 + j], f[c + 36 + j]
+            v0, v1, v2 = f[c + 54 + j], f[c + 72 + j], f[c + 90 + j]
+            p0, p1, p2 = f[c + 108 + j], f[c + 126 + j], f[c + 144 + j]
+            e0, e1 = f[c + 288 + j], f[c + 306 + j]
+            u0 = d2 * t1 - d1 * t2 - dt * f[c + 216 + j] + c00 * e0 + c01 * e1
+            u1 = d0 * t2 - d2 * t0 - dt * f[c + 234 + j] + c10 * e0 + c11 * e1
+            u2 = d1 * t0 - d0 * t1 - dt * f[c + 252 + j] + c20 * e0 + c21 * e1
             p0 += dt * v0 + h * u0
             p1 += dt * v1 + h * u1
             p2 += dt * v2 + h * u2
             v0 += u0
             v1 += u1
             v2 += u2
-            t0 -= dt * s[c + 162 + j]
-            t1 -= dt * s[c + 180 + j]
-            t2 -= dt * s[c + 198 + j]
-            s[c + j] = a00 * t0 + a01 * t1 + a02 * t2
-            s[c + 18 + j] = a10 * t0 + a11 * t1 + a12 * t2
-            s[c + 36 + j] = a20 * t0 + a21 * t1 + a22 * t2
-            s[c + 54 + j] = a00 * v0 + a01 * v1 + a02 * v2
-            s[c + 72 + j] = a10 * v0 + a11 * v1 + a12 * v2
-            s[c + 90 + j] = a20 * v0 + a21 * v1 + a22 * v2
-            s[c + 108 + j] = a00 * p0 + a01 * p1 + a02 * p2
-            s[c + 126 + j] = a10 * p0 + a11 * p1 + a12 * p2
-            s[c + 144 + j] = a20 * p0 + a21 * p1 + a22 * p2
+            t0 -= dt * f[c + 162 + j]
+            t1 -= dt * f[c + 180 + j]
+            t2 -= dt * f[c + 198 + j]
+            f[c + j] = a00 * t0 + a01 * t1 + a02 * t2
+            f[c + 18 + j] = a10 * t0 + a11 * t1 + a12 * t2
+            f[c + 36 + j] = a20 * t0 + a21 * t1 + a22 * t2
+            f[c + 54 + j] = a00 * v0 + a01 * v1 + a02 * v2
+            f[c + 72 + j] = a10 * v0 + a11 * v1 + a12 * v2
+            f[c + 90 + j] = a20 * v0 + a21 * v1 + a22 * v2
+            f[c + 108 + j] = a00 * p0 + a01 * p1 + a02 * p2
+            f[c + 126 + j] = a10 * p0 + a11 * p1 + a12 * p2
+            f[c + 144 + j] = a20 * p0 + a21 * p1 + a22 * p2
         if second == 0:
             for i in range(9):
                 for j in range(i):
-                    swap = s[c + 18 * i + j]
-                    s[c + 18 * i + j] = s[c + 18 * j + i]
-                    s[c + 18 * j + i] = swap
+                    swap = f[c + 18 * i + j]
+                    f[c + 18 * i + j] = f[c + 18 * j + i]
+                    f[c + 18 * j + i] = swap
                 for j in range(9, N):
-                    s[c + 18 * j + i] = s[c + 18 * i + j]
+                    f[c + 18 * j + i] = f[c + 18 * i + j]
 
     angle_noise = gyro_noise * gyro_noise * dt
     velocity_noise = accel_noise * accel_noise * dt
     for i in range(3):
-        s[c + 19 * (TH + i)] += angle_noise
-        s[c + 19 * (DV + i)] += velocity_noise
-        s[c + 19 * (DP + i)] += velocity_noise * dt * dt / 3.0
-        s[c + 18 * (DV + i) + DP + i] += velocity_noise * h
-        s[c + 18 * (DP + i) + DV + i] += velocity_noise * h
-        s[c + 19 * (DBG + i)] += gyro_bias_walk * gyro_bias_walk * dt
-        s[c + 19 * (DBA + i)] += accel_bias_walk * accel_bias_walk * dt
+        f[c + 19 * (TH + i)] += angle_noise
+        f[c + 19 * (DV + i)] += velocity_noise
+        f[c + 19 * (DP + i)] += velocity_noise * dt * dt / 3.0
+        f[c + 18 * (DV + i) + DP + i] += velocity_noise * h
+        f[c + 18 * (DP + i) + DV + i] += velocity_noise * h
+        f[c + 19 * (DBG + i)] += gyro_bias_walk * gyro_bias_walk * dt
+        f[c + 19 * (DBA + i)] += accel_bias_walk * accel_bias_walk * dt
 
 
 @_jit
@@ -898,7 +902,7 @@ def _run_to(s, prm, fixes, fix_end, t_end):
                         az = GRAVITY * az + s[o + BA + 2]
                         rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], prm[NO_IMU_ACCEL_NOISE]
                     predict(
-                        s, o, gx, gy, gz, ax, ay, az, dt,
+                        s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt,
                         rate_noise, force_noise, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK],
                     )  # fmt: skip
             if part == 1.0:
@@ -932,7 +936,7 @@ def _copy(a, b):
         b[i] = a[i]
 
 
-@_jit
+@_inline
 def _keep_checkpoint(s, prm, checkpoints, meta):
     end = int(meta[CP_END])
     if s[T] - checkpoints[(end - 1) & CP_MASK, T] < prm[BUFFER] / CP_PER_BUFFER and end > meta[CP_FIRST]:
@@ -983,7 +987,7 @@ def _advance(s, prm, imu, fixes, checkpoints, meta, until, live):
             _keep_checkpoint(s, prm, checkpoints, meta)
 
 
-@_jit
+@_inline
 def _precedes_sample(s, t, gap):
     """Whether this state is as it would be if a sample stamped t were known to follow."""
     return s[T] < t and (s[TRAILING] == 0.0 or t - s[T_IMU] > gap)
@@ -1022,7 +1026,7 @@ def _drop_orphans(checkpoints, meta):
         meta[CP_FIRST] += 1.0
 
 
-@_jit
+@_inline
 def _insert_sample(s, prm, imu, checkpoints, meta, samples, row):
     """Put samples[row] in its place in the ring, and rewind the state if it is not at the end. False: dropped."""
     t = samples[row, 0]
@@ -1142,28 +1146,22 @@ def _rotate(rotation, r, q, at):
 
 
 @_jit
-def _left(ch, dt):
-    """What is left of E after dt s, as factors of its position and its rotation: it decays, but not too fast."""
-    left = np.ones(2)
-    if dt <= 0.0:
-        return left
-    decay = 1.0 - math.exp(-dt / SMOOTH_TIME)
-    for i in range(2):
-        size = math.sqrt(ch[E + 3 * i] ** 2 + ch[E + 3 * i + 1] ** 2 + ch[E + 3 * i + 2] ** 2)
-        if size > 0.0:
-            most = (SMOOTH_SPEED if i == 0 else SMOOTH_RATE) * dt
-            left[i] = 1.0 - min(decay, most / size)
-    return left
+def _left(ch, i, dt):
+    """What is left of E after dt s, as a factor, of its position (i = 0) or its rotation (1)."""
+    size2 = ch[E + 3 * i] ** 2 + ch[E + 3 * i + 1] ** 2 + ch[E + 3 * i + 2] ** 2
+    if dt <= 0.0 or size2 == 0.0:
+        return 1.0
+    most = (SMOOTH_SPEED if i == 0 else SMOOTH_RATE) * dt
+    return 1.0 - min(1.0 - math.exp(-dt / SMOOTH_TIME), most / math.sqrt(size2))
 
 
 @_jit
 def _move(out, position, quaternion, ch, dt):
     """Move a pose of the filter by what is left of E after dt s."""
-    left = _left(ch, dt)
     turn = np.empty(3)
     for i in range(3):
-        out[position + i] += left[0] * ch[E + i]
-        turn[i] = left[1] * ch[E + 3 + i]
+        out[position + i] += _left(ch, 0, dt) * ch[E + i]
+        turn[i] = _left(ch, 1, dt) * ch[E + 3 + i]
     _rotate(turn, 0, out, quaternion)
 
 
@@ -1173,9 +1171,10 @@ def _absorb(s, ch, plain):
     # Where both would have been at the latest instant that is known outside.
     at = s[T] if plain else min(max(ch[E_PUBLISHED], s[T]), s[T] + SMOOTH_REACH)
     if at > ch[E_T]:
-        left = _left(ch, at - ch[E_T])
-        for i in range(6):
-            ch[E + i] *= left[i // 3]
+        position, rotation = _left(ch, 0, at - ch[E_T]), _left(ch, 1, at - ch[E_T])
+        for i in range(3):
+            ch[E + i] *= position
+            ch[E + 3 + i] *= rotation
         ch[E_T] = at
     if plain:
         # only pseudo-measurements, and the motion itself, which is none of E's business
@@ -1209,8 +1208,8 @@ def _absorb(s, ch, plain):
         n = math.sqrt(x * x + y * y + z * z)
         factor = (2.0 if n < 1e-9 else 2.0 * math.atan2(n, abs(w)) / n) * (-1.0 if w < 0.0 else 1.0)
         ch[E + 3], ch[E + 4], ch[E + 5] = factor * x, factor * y, factor * z
-    far = math.sqrt(ch[E] ** 2 + ch[E + 1] ** 2 + ch[E + 2] ** 2) > SMOOTH_DISTANCE
-    turned = math.sqrt(ch[E + 3] ** 2 + ch[E + 4] ** 2 + ch[E + 5] ** 2) > SMOOTH_ANGLE
+    far = ch[E] ** 2 + ch[E + 1] ** 2 + ch[E + 2] ** 2 > SMOOTH_DISTANCE * SMOOTH_DISTANCE
+    turned = ch[E + 3] ** 2 + ch[E + 4] ** 2 + ch[E + 5] ** 2 > SMOOTH_ANGLE * SMOOTH_ANGLE
     if far or turned or s[RESET_ID] != ch[E_RESET_ID]:
         ch[E_RESETS] += 1.0
         ch[E_RESET_ID] = s[RESET_ID]
@@ -1329,10 +1328,10 @@ def process(memory, task, channel, t, inputs, outputs):
             ch[E_PUBLISHED] = max(ch[E_PUBLISHED], t)
             _move(out, P_POS, P_QUAT, ch, t - ch[E_T])
             # E is known, and not the filter's error: what is left of it adds to the second moment.
-            left = _left(ch, t - ch[E_T])
             for i in range(6):
                 for j in range(6):
-                    out[P_COV + 6 * i + j] += left[i // 3] * left[j // 3] * ch[E + i] * ch[E + j]
+                    left = _left(ch, i // 3, t - ch[E_T]) * _left(ch, j // 3, t - ch[E_T])
+                    out[P_COV + 6 * i + j] += left * ch[E + i] * ch[E + j]
     return 1
 
 

@@ -58,7 +58,7 @@ def error(s, other):
 
 def predict(s, dt, noise=(0.0, 0.0, 0.0, 0.0)):
     out = s.copy()
-    k.predict(out, 0, *INPUT, dt, *noise)
+    k.predict(out[: k.BLOCK], *INPUT, dt, *noise)
     return out
 
 
