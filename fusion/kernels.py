@@ -74,8 +74,9 @@ STILL_BARRED = AUX + 55  # s: not at rest until then, a fix has said otherwise
 MOVING_GYRO, MOVING_ACCEL = AUX + 56, AUX + 57  # mean variance of a window in motion
 STILL_SURE = AUX + 58  # 1 where rest and motion differ in that
 USUAL_SPEED2 = AUX + 59  # (m/s)^2: mean squared speed along an axis while the robot moves
+REJECTED_RUN = AUX + 66  # rejects since the last accepted fix
 CORRECTED = AUX + 60  # sum of all moves by updates, world axes: position (3), rotation vector (3)
-STATE = AUX + 66
+STATE = AUX + 67
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -161,6 +162,7 @@ SMOOTH_TIME = 0.1  # s: E decays with this time constant,
 SMOOTH_SPEED, SMOOTH_RATE = 0.3, math.radians(60.0)  # m/s, rad/s: but not faster than this,
 SMOOTH_DISTANCE, SMOOTH_ANGLE = 0.25, math.radians(20.0)  # m, rad: and beyond this the channel steps, and says so
 SMOOTH_REACH = 0.5  # s: so far ahead of the newest input a published pose is kept from moving
+OUTLIER_DISTANCE = 0.15  # m: a fix that is rejected by less tells of noise, not of a mistake
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
 STILL_SPEED_SIGMA = 0.01  # m/s
@@ -680,21 +682,38 @@ def _judge(s, prm, fix):
             R += (ratio - 1.0) * S
         if update(s, o, H, y, R):
             if o == MAIN:
-                s[SHADOW_COUNT] = 0.0
+                s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
                 s[ACCEPTED_COUNT] += 1.0
                 s[T_ACCEPTED] = s[T]
                 return
             agrees = True
-            # Rejects that agree: so far off is not the fix but the filter, unless they are turned, as flips are.
-            turned = figures[F_INNOVATION - F_D2 + 3 : F_SIGMA - F_D2]
-            angle = math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2)
-            _adapt(s, prm, figures, 6.0 if angle < prm[REINIT_ANGLE] else 0.0)
     fix[F_OUTCOME] = REJECTED
     fix[F_D2:F_REPORTED] = figures
+    # A reject that is not far off, that agrees with the one before, or is one of many, is no outlier: something is
+    # noisier than it says. Unless it is turned, as flips are.
+    far = (
+        math.sqrt(
+            figures[F_INNOVATION - F_D2] ** 2
+            + figures[F_INNOVATION - F_D2 + 1] ** 2
+            + figures[F_INNOVATION - F_D2 + 2] ** 2
+        )
+        > OUTLIER_DISTANCE
+    )
+    turned = (
+        math.sqrt(
+            figures[F_INNOVATION - F_D2 + 3] ** 2
+            + figures[F_INNOVATION - F_D2 + 4] ** 2
+            + figures[F_INNOVATION - F_D2 + 5] ** 2
+        )
+        > prm[REINIT_ANGLE]
+    )
+    s[REJECTED_RUN] += 1.0
+    if agrees or not (far or turned) or s[REJECTED_RUN] >= prm[REINIT_COUNT]:
+        _adapt(s, prm, figures, 0.0 if turned else 6.0)
     if not shadows:
         s[REJECTED_SINCE] = s[T]
     patient = s[T] - s[REJECTED_SINCE] >= prm[REINIT_PATIENCE]
-    known = s[ACCEPTED_COUNT] >= prm[REINIT_COUNT]
+    known = s[ACCEPTED_COUNT] >= 2.0 * prm[REINIT_COUNT]
     if agrees:
         s[SHADOW_COUNT] += 1.0
         # Is the shadow's attitude what the gyro made of the attitude since the last accepted fix?
@@ -713,11 +732,12 @@ def _judge(s, prm, fix):
         # A filter that only its first fixes vouch for has no biases worth keeping.
         _start(s, SHADOW, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
         s[SHADOW_COUNT] = 1.0
-        take = patient
+        # Not even with each other do they agree, so many in a row: then any is better than none of them.
+        take = patient or (s[REJECTED_RUN] >= 2.0 * prm[REINIT_COUNT] and not turned)
     if take:
         s[MAIN:SHADOW] = s[SHADOW:AUX]
         s[ACCEPTED_COUNT] = s[SHADOW_COUNT]
-        s[SHADOW_COUNT] = 0.0
+        s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
         s[RESET_ID] += 1.0
         s[T_ACCEPTED] = s[T]
         fix[F_OUTCOME] = REINIT

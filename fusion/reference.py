@@ -172,7 +172,7 @@ class _State:
         self.main = ErrorStateFilter()
         self.shadow: ErrorStateFilter | None = None
         self.shadow_count = 0
-        self.rejected_since = 0.0
+        self.rejected_since, self.rejected_run = 0.0, 0
         self.t = self.t_imu = self.t_accepted = -math.inf
         self.u = np.zeros(6)
         self.next_t = math.inf
@@ -570,7 +570,7 @@ class ReferenceTimeline:
                 fix[k.F_OUTCOME] = k.INFLATED
                 R = R + (ratio - 1.0) * S
             main.correct(H, y, R)
-            state.shadow, state.shadow_count = None, 0
+            state.shadow, state.shadow_count, state.rejected_run = None, 0, 0
             state.accepted_count += 1
             state.t_accepted = state.t
             return
@@ -578,7 +578,7 @@ class ReferenceTimeline:
         if state.shadow is None:
             state.rejected_since = state.t
         patient = state.t - state.rejected_since >= p.reinit_patience
-        known = state.accepted_count >= p.reinit_count
+        known = state.accepted_count >= 2 * p.reinit_count
         agrees = False
         if state.shadow is not None:
             H, y, R, S = self._weigh(state, state.shadow, fix)
@@ -586,10 +586,15 @@ class ReferenceTimeline:
             agrees = ratio <= p.gate_inflation
             R = R + max(ratio - 1.0, 0.0) * S
             fix[k.F_D2 : k.F_REPORTED] = figures
+        y_main = figures[k.F_INNOVATION - k.F_D2 : k.F_SIGMA - k.F_D2]
+        far = float(np.linalg.norm(y_main[:3])) > k.OUTLIER_DISTANCE
+        turned = float(np.linalg.norm(y_main[3:])) > p.reinit_angle
         if state.shadow is not None and agrees:
             state.shadow.correct(H, y, R)
-            angle = float(np.linalg.norm(figures[k.F_INNOVATION - k.F_D2 + 3 : k.F_SIGMA - k.F_D2]))
-            self._adapt(state, figures, 6.0 if angle < p.reinit_angle else 0.0)
+        state.rejected_run += 1
+        if agrees or not (far or turned) or state.rejected_run >= p.reinit_count:
+            self._adapt(state, figures, 0.0 if turned else 6.0)
+        if state.shadow is not None and agrees:
             state.shadow_count += 1
             take = state.shadow_count >= p.reinit_count and (
                 patient or not known or self._attitudes_agree(state, main, state.shadow)
@@ -601,8 +606,9 @@ class ReferenceTimeline:
                 state.shadow.P = self._prior()
             state.shadow.start(self._hypothesis(fix, int(fix[k.F_CHOSEN])), p.velocity_sigma)
             state.shadow_count = 1
-            take = patient
+            take = patient or (state.rejected_run >= 2 * p.reinit_count and not turned)
         if take:
+            state.rejected_run = 0
             state.main, state.shadow = state.shadow, None
             state.accepted_count, state.shadow_count = state.shadow_count, 0
             state.reset_id += 1
