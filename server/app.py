@@ -70,6 +70,8 @@ SILENCE = 3.0
 HELLO_TIMEOUT = 10.0
 # s between clock questions, for the first ones and then.
 CLOCK_FAST, CLOCK_FAST_COUNT, CLOCK_SLOW = 0.1, 10, 1.0
+# s between two diagnoses of each robot: one takes about 2 ms.
+DIAGNOSE_EVERY = 5.0
 # s that closing may take: for clients that do not answer, and for threads that hang in a driver.
 CLOSE_TIMEOUT = 0.7
 
@@ -184,6 +186,7 @@ class Service:
             camera.start()
         self._spawn(self._warm_up())
         self._spawn(self._publish())
+        self._spawn(self._diagnose())
         for robot in self.robots.values():
             if robot.config.imu.source != "websocket":
                 self._spawn(self._read_serial(robot))
@@ -340,6 +343,14 @@ class Service:
             due = max(due + period, now)
             await asyncio.sleep(due - time.monotonic())
 
+    async def _diagnose(self) -> None:
+        await self.ready.wait()
+        while True:
+            await asyncio.sleep(DIAGNOSE_EVERY)
+            for name, robot in self.robots.items():
+                for text in robot.diagnose(time.monotonic()):
+                    log.info("robot %s: %s", name, text)
+
     def health(self) -> dict[str, Any]:
         now = time.monotonic()
         # Asked before it is compiled, a filter would compile here and now.
@@ -358,6 +369,9 @@ class Service:
                 reasons.append(f"robot {name}: {robot['imu']}")
             elif robot["mode"] != "FULL":
                 reasons.append(f"robot {name}: {_MODES[robot['mode']]}")
+            # What a fix's absence has to say, the mode has said.
+            told = [d["text"] for d in robot["diagnoses"] if d["severity"] != "note" and d["code"] != "no_fix"]
+            reasons += [f"robot {name}: {text}" for text in told]
         return {
             "status": "degraded" if reasons else "ok",
             "reasons": reasons,

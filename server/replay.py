@@ -14,11 +14,15 @@ import numpy as np
 from tqdm import tqdm
 
 from fusion.consistency import hold_last, track_error
+from fusion.health import Health
 from fusion.localiser import Localiser, warm_up
 from fusion.measurements import Array, FixOutcome, Outcome
 from fusion.params import Engine, FilterParams, Motion
 from server import config
 from server.recording import Recording, RecordingError, load, robot_folders, write_tum
+
+# s of the recording between two diagnoses: what is wrong in between only is to be told too.
+DIAGNOSE_EVERY = 20.0
 
 ACCEPTED = (Outcome.INITIALISED, Outcome.ACCEPTED, Outcome.INFLATED, Outcome.REINITIALISED)
 
@@ -34,33 +38,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
 
 
-def replay(recording: Recording, localiser: Localiser, progress: Any = None) -> tuple[Array, list[FixOutcome], float]:
+def replay(
+    recording: Recording, localiser: Localiser, progress: Any = None, health: Health | None = None
+) -> tuple[Array, list[FixOutcome], float]:
     """Feed a recording to a localiser in order of arrival, a fix before a sample that arrives with it.
 
     -> the causal track (n, 8), a row per IMU sample in order of arrival: its stamp, position, quaternion wxyz, NaN
     before the first fix; the fixes' outcomes; the seconds that it took. `progress` is called with the number of
-    samples done.
+    samples done; `health` looks on.
     """
     track = np.full((len(recording.samples), 8), np.nan)
     outcomes: list[FixOutcome] = []
     stops = np.searchsorted(recording.arrival, [fix.arrival for fix in recording.fixes], side="left")
     at = 0
     began = time.perf_counter()
+
+    def feed_samples(stop: int) -> None:
+        localiser.feed_samples(recording.samples[at:stop], track[at:stop])
+        judged = localiser.judged()
+        outcomes.extend(judged)
+        if health is not None:
+            health.judged(judged)
+            health.sampled(recording.samples[at:stop], track[at:stop])
+
+    due = recording.arrival[0] + DIAGNOSE_EVERY
     for fix, stop in zip(recording.fixes, stops, strict=True):
         if stop > at:
-            localiser.feed_samples(recording.samples[at:stop], track[at:stop])
-            outcomes += localiser.judged()
+            feed_samples(int(stop))
             at = int(stop)
             if progress is not None:
                 progress(at)
-        outcomes += localiser.feed(fix)
-    localiser.feed_samples(recording.samples[at:], track[at:])
-    outcomes += localiser.judged()
+        if health is not None:
+            if fix.arrival >= due:
+                health.diagnoses(fix.arrival)
+                due = fix.arrival + DIAGNOSE_EVERY
+            health.arrived(fix)
+        judged = localiser.feed(fix)
+        outcomes += judged
+        if health is not None:
+            health.judged(judged)
+    feed_samples(len(recording.samples))
+    if health is not None:
+        health.diagnoses(_end(recording))
     return track, outcomes, time.perf_counter() - began
 
 
-def summary(recording: Recording, localiser: Localiser, track: Array, outcomes: list[FixOutcome], took: float) -> Any:
+def _end(recording: Recording) -> float:
+    return max(float(recording.arrival[-1]), recording.fixes[-1].arrival if recording.fixes else -math.inf)
+
+
+def summary(recording: Recording, health: Health, track: Array, outcomes: list[FixOutcome], took: float) -> Any:
     """What there is to say of a replay, as plain values; None where nothing can be said."""
+    localiser = health.localiser
+    began, end = float(recording.arrival[0]), _end(recording)
     span = float(np.ptp(recording.samples[:, 0]))
     counts = localiser.counts
     d2 = [outcome.d2 for outcome in outcomes if outcome.outcome in (Outcome.ACCEPTED, Outcome.INFLATED)]
@@ -69,6 +99,7 @@ def summary(recording: Recording, localiser: Localiser, track: Array, outcomes: 
         "motion": localiser.motion,
         "engine": localiser.engine,
         "duration_s": span,
+        "ended_s": end - began,
         "samples": counts["imu_samples"],
         "samples_dropped": counts["imu_duplicates"] + counts["imu_late"],
         "fixes": len(recording.fixes),
@@ -78,9 +109,13 @@ def summary(recording: Recording, localiser: Localiser, track: Array, outcomes: 
         "outcomes": {outcome.name.lower(): counts[outcome.name.lower()] for outcome in Outcome if outcome},
         "resets": counts["reinitialised"],
         "nis_mean": float(np.mean(d2)) if d2 else None,
-        "gyro_bias": localiser.gyro_bias.tolist(),
-        "accel_bias": localiser.accel_bias.tolist(),
         "speed": span / took if took > 0.0 else None,
+        **health.figures(end),
+        "diagnoses": [
+            {"code": diagnosis.code, "severity": diagnosis.severity, "text": diagnosis.text}
+            | {"evidence": diagnosis.evidence, "from_s": since - began, "to_s": until - began}
+            for since, until, diagnosis in health.said.values()
+        ],
     }
     if recording.truth is not None:
         error = track_error(track, recording.truth)
@@ -114,9 +149,18 @@ def _table(s: Any) -> str:
         rows.append(("holding the last fix", f"{s['hold_last_mm']:.1f} mm, {s['hold_last_deg']:.2f} deg"))
     elif "rmse_mm" in s:
         rows.append(("RMSE", "no pose at an instant that the truth covers"))
+    accuracy = s["accuracy"]
+    if accuracy["fixes"]:
+        half, most = ((accuracy[f"mm_{p}"], accuracy[f"deg_{p}"]) for p in ("p50", "p95"))
+        text = f"half within {half[0]:.1f} mm, {half[1]:.2f} deg; 95 % within {most[0]:.1f} mm, {most[1]:.2f} deg"
+        rows.append(("poses against fixes", text))
     if s["speed"]:
         rows.append(("speed", f"{s['speed']:.0f} x real time"))
-    return "\n".join(f"{name:<22}{text}" for name, text in rows)
+    lines = [f"{name:<22}{text}" for name, text in rows]
+    for diagnosis in s["diagnoses"]:
+        when = "" if diagnosis["to_s"] >= s["ended_s"] else f" (last seen at {diagnosis['to_s']:.0f} s)"
+        lines.append(f"{diagnosis['severity']:<22}{diagnosis['text']}{when}")
+    return "\n".join(lines)
 
 
 def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion, Engine]:
@@ -146,13 +190,13 @@ def run(args: argparse.Namespace) -> int:
         recording = load(folder, params)
         if engine == "numba":
             warm_up()
-        localiser = Localiser(recording.name, params, motion, engine)
+        health = Health(Localiser(recording.name, params, motion, engine))
         with tqdm(
             total=len(recording.samples), unit=" samples", delay=1.0, leave=False, disable=not sys.stderr.isatty()
         ) as bar:
-            result = replay(recording, localiser, lambda done, bar=bar: bar.update(done - bar.n))
+            result = replay(recording, health.localiser, lambda done, bar=bar: bar.update(done - bar.n), health)
         track, _, _ = result
-        figures = summary(recording, localiser, *result)
+        figures = summary(recording, health, *result)
         print(json.dumps(figures) if args.json else _table(figures))
         if args.out is not None:
             write_tum(args.out / f"{recording.name}.tum" if len(folders) > 1 else args.out, track)

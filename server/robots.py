@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from fusion.health import Diagnosis, Health
 from fusion.localiser import Localiser
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix
 from imu.clock import DeviceClock
@@ -19,6 +20,8 @@ from server.messages import encode, pose_message
 
 # Seconds over which the rate of the IMU is counted.
 RATE_WINDOW = 2.0
+# Seconds for which a diagnosis must not have been made until it is gone: one at its threshold comes and goes.
+GONE_AFTER = 30.0
 
 
 class Recording(Protocol):
@@ -38,6 +41,8 @@ class Robot:
     def __init__(self, config: RobotConfig, recording: Recording | None = None) -> None:
         self.config = config
         self.localiser = Localiser(config.name, config.filter, config.motion, config.engine)
+        self.vitals = Health(self.localiser)
+        self.diagnoses: list[Diagnosis] = []
         self.clock = DeviceClock()
         # Why no IMU data come, in words, or "" while they do.
         self.trouble = "no IMU has connected yet"
@@ -47,6 +52,7 @@ class Robot:
         self.published = 0
         self._recording = recording
         self._arrivals: deque[tuple[float, int]] = deque()
+        self._told: set[tuple[str, str]] = set()
 
     def connected(self) -> None:
         """Its IMU is there, perhaps with a clock that has begun anew."""
@@ -66,12 +72,12 @@ class Robot:
         while self._arrivals[0][0] < arrival - RATE_WINDOW:
             self._arrivals.popleft()
         batch = ImuBatch(self.config.name, now, self.clock.stamp(raw, arrival))
-        if self._recording is None:
-            self.localiser.feed(batch)
-        else:
-            track = np.full((len(raw), 8), np.nan)
+        track = np.full((len(raw), 8), np.nan)
+        if self._recording is not None:
             self._recording.imu(batch)
-            self.localiser.feed(batch, track)
+        self.vitals.judged(self.localiser.feed(batch, track))
+        self.vitals.sampled(batch.samples, track)
+        if self._recording is not None:
             self._recording.track(self.config.name, track)
 
     def feed_fix(self, fix: PoseFix, now: float) -> None:
@@ -79,7 +85,8 @@ class Robot:
         fix = replace(fix, arrival=now)
         if self._recording is not None:
             self._recording.fix(fix)
-        self.localiser.feed(fix)
+        self.vitals.arrived(fix)
+        self.vitals.judged(self.localiser.feed(fix))
 
     def publish(self, now: float) -> Pose | None:
         """The pose for this instant; None before the first fix."""
@@ -104,6 +111,18 @@ class Robot:
         # The first arrival only opens the window: its samples were taken before it.
         return sum(n for _, n in recent[1:]) / max(recent[-1][0] - recent[0][0], 1e-3)
 
+    def diagnose(self, now: float) -> list[str]:
+        """Bring `diagnoses` up to date. -> what is new, for the log: each once when it comes and when it goes."""
+        self.diagnoses = self.vitals.diagnoses(now)
+        news = [diagnosis.text for diagnosis in self.diagnoses if diagnosis.key not in self._told]
+        self._told.update(diagnosis.key for diagnosis in self.diagnoses)
+        for key in sorted(self._told):
+            _, until, diagnosis = self.vitals.said[key]
+            if now - until > GONE_AFTER:
+                self._told.remove(key)
+                news.append(f"no longer: {diagnosis.text}")
+        return news
+
     def health(self, now: float, ready: bool = True) -> dict[str, Any]:
         """What there is to say of it. `ready`: whether the filter may be asked."""
         pose = self.localiser.pose_at(now) if ready else None
@@ -123,4 +142,8 @@ class Robot:
             "poses_published": self.published,
             "reset_id": 0 if pose is None else pose.reset_id,
             "counts": dict(self.localiser.counts),
+            "diagnoses": [
+                {"code": d.code, "severity": d.severity, "text": d.text, "evidence": d.evidence} for d in self.diagnoses
+            ],
+            **self.vitals.figures(now),
         }

@@ -10,6 +10,7 @@ import os
 import socket
 import time
 import tty
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from websockets.exceptions import ConnectionClosed
 
 from camera.calibration import CalibrationError, Intrinsics, save_intrinsics
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix
+from imu.protocols import RawSample
 from server.app import Service
 from server.config import CameraConfig, Config, ConfigError, parse
 from tests.server.room import (
@@ -74,6 +76,38 @@ def test_health() -> None:
             assert found["robots"]["rover"]["mode"] == "NO_IMU"
             assert 0.04 < found["robots"]["rover"]["fix_age"] < 10.0
             assert found["robots"]["rover"]["counts"]["initialised"] == 1
+
+    run(main)
+
+
+def test_a_diagnosis_is_in_the_health_and_told_once_when_it_comes_and_once_when_it_goes() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            robot = service.robots["rover"]
+            now = time.monotonic()
+
+            def on(seconds: float, one: float) -> None:
+                """An IMU at rest that reads gravity as `one`, and fixes, as fast as the filter takes them."""
+                nonlocal now
+                for _ in range(round(seconds / 0.5)):
+                    stamps = (now + 0.01 * np.arange(50)).tolist()
+                    robot.feed_imu([RawSample(t, 0.0, 0.0, 0.0, 0.0, 0.0, one) for t in stamps], stamps[-1], stamps[-1])
+                    robot.feed_fix(replace(fix(), t=stamps[25]), stamps[-1])
+                    now += 0.5
+
+            on(20.0, 1.0)
+            (news,) = robot.diagnose(now)
+            assert news == "the accelerometer reads 1.00 on the mean: these are g, not m/s2"
+            assert robot.diagnose(now) == []
+            found = await health(service)
+            assert f"robot rover: {news}" in found["reasons"]
+            (diagnosis,) = found["robots"]["rover"]["diagnoses"]
+            assert (diagnosis["code"], diagnosis["severity"], diagnosis["text"]) == ("accel_unit", "error", news)
+            assert found["robots"]["rover"]["nis"]["pose"]["fixes"] > 0
+            assert found["robots"]["rover"]["accuracy"]["fixes"] > 0
+            on(60.0, 9.81)
+            assert [text for text in robot.diagnose(now) if news in text] == [f"no longer: {news}"]
+            assert [text for text in robot.diagnose(now) if news in text] == []
 
     run(main)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from fusion.consistency import rms, track_error
 from fusion.localiser import Localiser
 from fusion.measurements import ImuBatch, PoseFix, PoseHypothesis
-from fusion.params import FilterParams
+from fusion.params import GRAVITY, FilterParams
+from fusion.simulator import CameraParams, random_ground, simulate
 from server.cli import main
 from server.recording import FIX_COLUMNS, Recorder, RecordingError, load, robot_folders
 from server.replay import replay
@@ -143,6 +145,53 @@ def test_command_prints_a_table_and_writes_tum(recorded, tmp_path, capsys):
     assert "RMSE" in table
     assert "holding the last fix" in table
     np.testing.assert_array_equal(np.loadtxt(tmp_path / "poses.tum"), np.loadtxt(folder / "poses.tum"))
+
+
+def late_stamps(folder):
+    """A recording of a minute of a camera that stamps its frames 40 ms late."""
+    simulation = simulate(random_ground(3), 3, 60.0, camera=CameraParams(stamp_error=0.04))
+    recorder = Recorder(folder, ["rover"])
+    recorder.imu(ImuBatch("rover", 0.0, simulation.samples))
+    for fix in simulation.fixes:
+        recorder.fix(replace(fix, robot="rover"))
+    recorder.close()
+    return folder / "rover"
+
+
+def test_command_says_what_is_wrong(tmp_path, capsys):
+    folder = late_stamps(tmp_path)
+    # Recorded in one batch, the IMU has no arrivals of its own.
+    lines = (folder / "imu.csv").read_text().splitlines()
+    (folder / "imu.csv").write_text("\n".join(line.rsplit(",", 1)[0] for line in lines))
+    assert main(["replay", str(folder), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["time_offset_ms"] == pytest.approx(-40.0, abs=10.0)
+    assert 0.0 < figures["time_offset_sigma_ms"] < 10.0
+    assert len(figures["tilt_deg"]) == len(figures["tilt_sigma_deg"]) == 2
+    assert max(figures["gyro_bias_sigma"]) < 0.01
+    assert max(figures["accel_bias_sigma"]) < 0.2
+    assert figures["nis"]["position"]["low"] < 1.0 < figures["nis"]["position"]["high"]
+    assert figures["resets"] == 0
+    assert figures["outcomes"]["accepted"] == figures["accuracy"]["fixes"] > 100
+    (diagnosis,) = figures["diagnoses"]
+    assert (diagnosis["code"], diagnosis["severity"]) == ("stamps", "note")
+    assert diagnosis["evidence"]["late_ms"] == pytest.approx(-figures["time_offset_ms"])
+    assert diagnosis["from_s"] < diagnosis["to_s"] == figures["ended_s"]
+
+    assert main(["replay", str(folder)]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("note  ")
+    assert diagnosis["text"] in last
+
+    # The same with an IMU that speaks in g: that is said, and what follows from it is not.
+    header, *rows = (folder / "imu.csv").read_text().splitlines()
+    numbers = np.array([[float(number) for number in row.split(",")] for row in rows])
+    numbers[:, 4:7] /= GRAVITY
+    (folder / "imu.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in numbers.tolist())]))
+    assert main(["replay", str(folder)]) == 0
+    table = capsys.readouterr().out
+    assert "these are g, not m/s2" in table
+    assert "stamps are" not in table
 
 
 def test_a_folder_of_robots(recorded, tmp_path, capsys):

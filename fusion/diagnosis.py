@@ -1,0 +1,446 @@
+"""What is wrong with a robot's localisation, in words, with the numbers that say so.
+
+Nothing is said unless it is both large enough to matter and significant; the thresholds stand together below. Most
+tests do not need the filter to be right: they compare samples with each other, fixes at rest with each other, or the
+rotation between fixes with the gyroscope's. Where an IMU is wrong altogether its consequences are not told as causes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from fusion.localiser import Localiser
+from fusion.measurements import Array, FixOutcome, Outcome, PoseHypothesis
+from fusion.params import GRAVITY
+
+Severity = Literal["note", "warning", "error"]
+
+WINDOW = 120.0  # s that a diagnosis looks back
+
+# --- When something is said: how large, and how significant ------------------------------------------------------
+SIGMAS = 5.0  # what is estimated with a sigma must be that many of them from what it should be
+OFFSET_LEAST = 0.005  # s of the stamps
+TILT_LEAST = math.radians(0.3)
+TILT_CHI2 = 30.0  # 2 degrees of freedom: 3e-7
+NOISE_LEAST = 1.5  # times the noise that is configured, or that fixes say
+NOISE_BLOCKS = 20  # blocks of white noise that the IMU's is taken from
+WHITE = 1.4  # variance by first over that by third differences: 1 for white noise, more in motion or vibration
+REST_RESIDUALS = 30  # components of fixes at rest that their noise is taken from
+REST_SIGMAS = 4.0
+STILL_RATE, STILL_FORCE = 0.02, 0.15  # rad/s, m/s2: a block at rest turns less, and differs less from the one before
+LEARNED_STEP, LEARNED_SPAN, LEARNED_LEAST = 0.25, 40.0, 2.0  # s between looks, s, times the IMU's noise
+TURNED_LEAST, TURNED_FIXES, TURNED_AGREE = math.radians(20.0), 8, 0.97  # agreement: length of the mean unit vector
+CAMERA_PAIRS, CAMERA_LEAST, CAMERA_APART = 10, 0.005, 0.25  # number, m, s
+MISSING_LEAST, GAPS_LEAST, GAP = 0.01, 5, 1.75  # share, number, times the usual step
+REPEATS_LEAST = 0.01
+# A sensor at its limit reads one value again and again; rates and forces below these are no full scale of any.
+LIMIT_LEAST, LIMIT_SAMPLES, LIMIT_RATIO = (2.0, 15.0), 20, 2.0
+FORCE_RANGE = (0.7 * GRAVITY, 1.3 * GRAVITY)  # m/s2: median specific force
+GRAVITY_ANGLE = math.radians(20.0)
+TURN_LEAST, TURN_PAIRS, TURN_STEP = 3.0, 8, 0.3  # rad, number, s: rotation between fixes that can judge a gyroscope
+LATE_SHARE, LATE_FIXES, LATE_OF_BUFFER = 0.01, 3, 0.8
+NO_FIX = 5.0  # s
+RESETS = 2
+
+BLOCK = 32  # samples
+
+BELIEVED = (Outcome.ACCEPTED, Outcome.INFLATED)
+_SENSORS = (("gyro", "gyroscope", "rad/s", slice(0, 3)), ("accel", "accelerometer", "m/s2", slice(3, 6)))
+_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates"}
+_BESIDES = {"imu_missing", "imu_stamps_repeat", "no_fix", "fixes_lost", "fixes_late", "fixes_early"}
+_EIGHT = ("+x", "+x and +y", "+y", "-x and +y", "-x", "-x and -y", "-y", "+x and -y")
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """A likely cause of trouble, or of what the filter has to make up for.
+
+    `code`: stable, for programs. `text`: for the person who can mend it. `evidence`: the numbers it rests on.
+    A note needs no action to keep the pose good; a warning costs accuracy; with an error there is no pose to rely on.
+    """
+
+    code: str
+    severity: Severity
+    text: str
+    evidence: dict[str, Any]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """The same for the same trouble, whatever its numbers."""
+        return self.code, str(self.evidence.get("source", ""))
+
+
+class JudgedFix(NamedTuple):
+    """A fix, its outcome, and the pose (7,) published for it; the last fix in that; how far it was off, m and rad."""
+
+    outcome: FixOutcome
+    pose: PoseHypothesis
+    published: Array | None
+    used: float
+    distance: float
+    angle: float
+
+
+class Chunk(NamedTuple):
+    """What remains of a run of samples. `blocks` (k, 20): first and last stamp, mean (6), noise variances (6, 6)."""
+
+    t: float
+    samples: int
+    step: float
+    missing: float
+    gaps: int
+    longest: float
+    repeats: int
+    top: Array
+    at_top: Array
+    near_top: Array
+    blocks: Array
+
+
+class Seen(NamedTuple):
+    """All that a diagnosis looks at: of `WINDOW` before `now`, on the clock of the stamps.
+
+    `began`: stamp of the first sample, NaN before it. `fixes`: judged ones, by stamp. `lost`: how many came too late.
+    `learned`: now and then the time and the filter's noise scale.
+    """
+
+    now: float
+    localiser: Localiser
+    began: float
+    chunks: Sequence[Chunk]
+    fixes: Sequence[JudgedFix]
+    lost: int
+    learned: Sequence[tuple[float, Array]]
+
+
+def diagnose(seen: Seen) -> list[Diagnosis]:
+    """What there is to say, likely causes before what the filter makes up for."""
+    fixes, planar = seen.fixes, seen.localiser.motion != "free"
+    found: list[Diagnosis] = []
+    if seen.chunks:
+        blocks = np.concatenate([chunk.blocks for chunk in seen.chunks])
+        found += [*_of_samples(seen, blocks), *_of_imu_and_fixes(fixes, blocks), *_of_rest(seen, blocks)]
+    found += _of_arrivals(seen)
+    codes = {diagnosis.code for diagnosis in found}
+    if codes & _ROOTS:
+        # Much else is wrong then, but nothing of it is the cause.
+        return [diagnosis for diagnosis in found if diagnosis.code in _ROOTS or diagnosis.code in _BESIDES]
+    odd = [*_of_turns(fixes), *_of_cameras(fixes, 2 if planar else 3)]
+    if not odd:
+        found += _of_learned(seen.learned, codes)
+    # Where noise is understated, so are the filter's sigmas.
+    understated = max([1.0, *(diagnosis.evidence["times"] for diagnosis in found if "noise" in diagnosis.code)])
+    return [*found, *odd, *_of_states(seen.localiser, understated)]
+
+
+def _of_samples(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
+    """Of the IMU alone: what is missing, clipped, noisy or in the wrong unit."""
+    chunks = seen.chunks
+    samples, missing = sum(c.samples for c in chunks), sum(c.missing for c in chunks)
+    gaps, longest = sum(c.gaps for c in chunks), max(c.longest for c in chunks)
+    share = missing / (samples + missing)
+    evidence: dict[str, Any]
+    if share >= MISSING_LEAST and gaps >= GAPS_LEAST:
+        text = f"IMU samples are missing: {share:.0%} (gaps of up to {1e3 * longest:.0f} ms)"
+        evidence = {"share": share, "gaps": gaps, "longest_ms": 1e3 * longest, "samples": samples}
+        yield Diagnosis("imu_missing", "warning", text, evidence)
+    repeats = sum(c.repeats for c in chunks) / samples
+    if repeats >= REPEATS_LEAST:
+        text = f"{repeats:.0%} of the IMU's stamps repeat the one before, and those samples are dropped"
+        yield Diagnosis("imu_stamps_repeat", "warning", text, {"share": repeats, "samples": samples})
+
+    step = float(np.median([chunk.step for chunk in chunks]))
+    mean, by_first, by_third = blocks[:, 2:8], blocks[:, 8:14], blocks[:, 14:20]
+    limit = np.max([chunk.top for chunk in chunks], axis=0)
+    for (name, sensor, unit, axes), least in zip(_SENSORS, LIMIT_LEAST, strict=True):
+        clipped = []
+        for i in range(axes.start, axes.stop):
+            there = [chunk for chunk in chunks if chunk.top[i] >= (1.0 - 1e-6) * limit[i]]
+            at, near = sum(int(c.at_top[i]) for c in there), sum(int(c.near_top[i]) for c in there)
+            if limit[i] >= least and at >= LIMIT_SAMPLES and at > LIMIT_RATIO * near:
+                clipped.append((float(limit[i]), "xyz"[i % 3], at, near))
+        if clipped:
+            value, names = min(clipped)[0], ", ".join(axis for _, axis, _, _ in clipped)
+            evidence = {"limit": value, "axes": names, "samples": sum(c[2] for c in clipped)}
+            text = f"the {sensor} saturates at {value:.2f} {unit} ({names})"
+            yield Diagnosis(f"{name}_saturates", "warning", text, evidence)
+        white = np.sum(by_first[:, axes], axis=1) < WHITE * np.sum(by_third[:, axes], axis=1)
+        if np.sum(white) >= NOISE_BLOCKS and math.isfinite(step):
+            noise = math.sqrt(step * float(np.median(np.mean(by_third[white][:, axes], axis=1))))
+            configured = getattr(seen.localiser.params, f"{name}_noise")
+            # 3 axes and 29 differences a block, which are correlated: as good as 30 independent ones.
+            sigmas = (noise / configured - 1.0) * math.sqrt(60.0 * np.sum(white))
+            if noise >= NOISE_LEAST * configured and sigmas >= SIGMAS:
+                text = f"the {sensor} is about {noise / configured:.1f} x noisier than configured ({name}_noise)"
+                evidence = {"times": noise / configured, "noise": noise, "configured": configured, "sigmas": sigmas}
+                yield Diagnosis(f"{name}_noise", "warning", text, evidence)
+    if len(blocks) >= NOISE_BLOCKS:
+        force = float(np.median(np.linalg.norm(mean[:, 3:], axis=1)))
+        if not FORCE_RANGE[0] < force < FORCE_RANGE[1]:
+            what = f"not {GRAVITY:.2f} m/s2: its unit or its scale is wrong"
+            for unit, one in (("g", 1.0), ("thousandths of g", 1000.0)):
+                if 0.8 * one < force < 1.2 * one:
+                    what = f"these are {unit}, not m/s2"
+            text = f"the accelerometer reads {force:.2f} on the mean: {what}"
+            yield Diagnosis("accel_unit", "error", text, {"force": force, "expected": GRAVITY, "blocks": len(blocks)})
+
+
+def _of_arrivals(seen: Seen) -> Iterator[Diagnosis]:
+    """Of when fixes come, and whether they are of use."""
+    localiser, fixes, lost, last = seen.localiser, seen.fixes, seen.lost, seen.localiser.last_fix
+    age = seen.now - (last if math.isfinite(last) else seen.began)
+    if age >= NO_FIX:
+        ignored = sum(fix.outcome.t > last and fix.outcome.outcome is Outcome.REJECTED for fix in fixes)
+        text = f"no fix for {age:.0f} s" if math.isfinite(last) else f"no fix yet, after {age:.0f} s"
+        text += f": {ignored} came and were not believed" if ignored else ""
+        yield Diagnosis("no_fix", "error", text, {"age_s": age, "not_believed": ignored})
+    delays = [fix.outcome.delay for fix in fixes]
+    buffer = localiser.params.buffer
+    if lost >= LATE_FIXES and lost >= LATE_SHARE * (lost + len(fixes)):
+        text = f"{lost} of {lost + len(fixes)} fixes came later than the buffer of {buffer:g} s and are lost"
+        yield Diagnosis("fixes_lost", "error", text, {"lost": lost, "fixes": lost + len(fixes), "buffer_s": buffer})
+    elif len(delays) >= TURNED_FIXES and (p95 := float(np.percentile(delays, 95))) > LATE_OF_BUFFER * buffer:
+        text = f"fixes arrive {p95:.1f} s late: beyond the buffer of {buffer:g} s they are lost"
+        yield Diagnosis("fixes_late", "warning", text, {"delay_p95_s": p95, "buffer_s": buffer})
+    early = [-delay for delay in delays if delay < 0.0]
+    if len(early) >= LATE_FIXES:
+        text = f"{len(early)} fixes are stamped up to {1e3 * max(early):.0f} ms after they arrived: another clock?"
+        yield Diagnosis("fixes_early", "warning", text, {"fixes": len(early), "most_ms": 1e3 * max(early)})
+    resets = sum(fix.outcome.outcome is Outcome.REINITIALISED for fix in fixes)
+    if resets >= RESETS:
+        text = f"the pose was set anew {resets} times in the last {WINDOW:.0f} s"
+        yield Diagnosis("resets", "warning", text, {"resets": resets})
+
+
+def _of_states(localiser: Localiser, understated: float) -> Iterator[Diagnosis]:
+    """Of what the filter has found out. `understated`: factor of its sigmas."""
+    offset, sigma = localiser.time_offset, understated * localiser.time_offset_sigma
+    if abs(offset) >= max(OFFSET_LEAST, SIGMAS * sigma) and sigma > 0.0:
+        which = "late" if offset < 0.0 else "early"
+        size = f"{1e3 * abs(offset):.0f} +- {1e3 * sigma:.0f} ms"
+        text = f"the camera's stamps are {size} {which}; that is made up for"
+        evidence = {"late_ms": -1e3 * offset, "sigma_ms": 1e3 * sigma, "sigmas": abs(offset) / sigma}
+        yield Diagnosis("stamps", "note", text, evidence)
+    tilt, covariance = localiser.tilt, localiser.tilt_covariance
+    angle = float(np.linalg.norm(tilt))
+    if angle >= TILT_LEAST and covariance[0, 0] > 0.0:
+        chi2 = float(tilt @ np.linalg.solve(covariance, tilt)) / understated**2
+        if chi2 >= TILT_CHI2:
+            towards = _EIGHT[round(math.atan2(tilt[1], tilt[0]) / (0.25 * math.pi)) % 8]
+            text = f"the floor rises by {math.degrees(angle):.1f} deg towards {towards}; that is made up for"
+            x, y = np.degrees(tilt).tolist()
+            yield Diagnosis("floor_tilt", "note", text, {"x_deg": x, "y_deg": y, "chi2": chi2})
+
+
+def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
+    """Fixes of a robot that stands still, or goes straight on, are on a line, but for their noise."""
+    noise = blocks[:, 8:14].reshape(-1, 2, 3).sum(axis=2)
+    quiet = np.all(noise <= 2.5 * np.quantile(noise, 0.1, axis=0), axis=1)
+    rate = np.linalg.norm(blocks[:, 2:5] - seen.localiser.gyro_bias, axis=1)
+    change = np.linalg.norm(np.diff(blocks[:, 5:8], axis=0, prepend=blocks[:1, 5:8]), axis=1)
+    of_rate, of_force = np.sqrt(noise / BLOCK).T
+    calm = quiet & (rate < STILL_RATE + 2.0 * of_rate) & (change < STILL_FORCE + 2.0 * of_force)
+    # Nor do the blocks around it: within one, a start can hide.
+    still = calm & np.append(calm[1:], False) & np.append(False, calm[:-1])
+    moving = np.concatenate([[0], np.cumsum(~still)])
+    by_source: dict[str, list[JudgedFix]] = {}
+    for fix in seen.fixes:
+        if not _is_turned(fix):
+            by_source.setdefault(fix.outcome.source, []).append(fix)
+    for source, own in by_source.items():
+        t = np.array([fix.outcome.t for fix in own]) + seen.localiser.time_offset
+        first, last = np.searchsorted(blocks[:, 1], t[:-1]), np.searchsorted(blocks[:, 0], t[1:], side="right")
+        rest = (last > first) & (moving[last] == moving[first]) & (last <= len(blocks)) & (t[1:] <= blocks[-1, 1])
+        residuals: list[Array] = []
+        begin = 0
+        for i in range(len(own)):
+            if i == len(own) - 1 or not rest[i]:
+                if i - begin >= 3:
+                    residuals.append(_residuals(t[begin : i + 1], own[begin : i + 1]))
+                begin = i + 1
+        if not residuals:
+            continue
+        for block, e in zip(("position", "attitude"), np.split(np.concatenate(residuals), 2, axis=1), strict=True):
+            # By the median, which a flipped pose does not disturb: 0.6745 sigma; its sigma is 1.17 / sqrt(n), and a
+            # little more since the residuals of a line are correlated.
+            times = float(np.median(np.abs(e))) / 0.6745
+            sigmas = (times - 1.0) * math.sqrt(e.size) / 1.4
+            if e.size >= REST_RESIDUALS and times >= NOISE_LEAST and sigmas >= REST_SIGMAS:
+                name = f" of camera {source}" if source else ""
+                text = f"fixes{name} are about {times:.1f} x less accurate in {block} than they say"
+                evidence = {"source": source, "times": times, "components": e.size, "sigmas": sigmas}
+                yield Diagnosis(f"fix_{block}_noise", "warning", text, evidence)
+
+
+def _of_learned(learned: Sequence[tuple[float, Array]], known: set[str]) -> Iterator[Diagnosis]:
+    """What noise the filter has learned, where no more direct test has found it."""
+    seconds = learned[-1][0] - learned[0][0] if learned else 0.0
+    if seconds < LEARNED_SPAN:
+        return
+    accel, gyro, *fix = np.median([scale for _, scale in learned], axis=0).tolist()
+    for block, times in zip(("position", "attitude"), fix, strict=True):
+        if times >= NOISE_LEAST and f"fix_{block}_noise" not in known:
+            text = f"fixes are about {times:.1f} x less accurate in {block} than they say, or their stamps jitter"
+            yield Diagnosis(f"fix_{block}_noise", "warning", text, {"times": times, "seconds": seconds})
+            known.add("noise")
+    # Of the two sensors one can get the blame for the other, or for fixes.
+    if not any("noise" in code for code in known):
+        for name, sensor, times in (("accel", "accelerometer", accel), ("gyro", "gyroscope", gyro)):
+            if times >= LEARNED_LEAST:
+                text = f"in motion the {sensor} is about {times:.1f} x worse than configured: vibration, or its scale"
+                yield Diagnosis(f"{name}_motion", "warning", text, {"times": times, "seconds": seconds})
+
+
+def _residuals(t: Array, fixes: Sequence[JudgedFix]) -> Array:
+    """(n, 6): of straight lines through the poses of fixes, over the sigmas that the fixes say, studentised."""
+    quaternions = np.array([fix.pose.quaternion_wxyz for fix in fixes])
+    turned = -_rotation(quaternions * [1.0, -1.0, -1.0, -1.0], quaternions[:1] * [1.0, -1.0, -1.0, -1.0])
+    poses = np.column_stack([[fix.pose.position for fix in fixes], turned])
+    sigma = np.sqrt([np.diag(fix.pose.covariance) for fix in fixes])
+    line = np.column_stack([np.ones_like(t), t - t.mean()])
+    hat = line @ np.linalg.pinv(line)
+    free: Array = 1.0 - np.diag(hat)
+    residuals: Array = (poses - hat @ poses) / sigma / np.sqrt(free)[:, np.newaxis]
+    return residuals
+
+
+def _of_imu_and_fixes(fixes: Sequence[JudgedFix], blocks: Array) -> Iterator[Diagnosis]:
+    """Does the IMU turn as the fixes do, and does its gravity point downwards in them?"""
+    t = np.array([fix.outcome.t for fix in fixes])
+    inside = (t >= blocks[0, 0]) & (t < blocks[-1, 1])
+    t = t[inside]
+    quaternions = np.array([fix.pose.quaternion_wxyz for fix in fixes])[inside]
+    if len(t) < TURN_PAIRS:
+        return
+    force = blocks[np.searchsorted(blocks[:, 0], t, side="right") - 1, 5:8]
+    w, x, y, z = quaternions.T
+    up = np.column_stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)])
+    # Medians, so that what the robot accelerates averages out; of one that turns over nothing remains to compare.
+    force, up = np.median(force, axis=0), np.median(up, axis=0)
+    angle = math.atan2(float(np.linalg.norm(np.cross(force, up))), float(force @ up))
+    if angle >= GRAVITY_ANGLE and np.linalg.norm(up) > 0.5:
+        axis = int(np.argmax(np.abs(force)))
+        name = "-+"[int(force[axis] > 0.0)] + "xyz"[axis]
+        text = (
+            f"gravity is on the wrong axis: at rest {name} reads it, {math.degrees(angle):.0f} deg from where it is "
+            "upwards in the fixes; the IMU is mounted turned, or its axes have other names or signs"
+        )
+        evidence = {"angle_deg": math.degrees(angle), "axis": name, "force": force.tolist(), "fixes": len(t)}
+        yield Diagnosis("imu_mounting", "error", text, evidence)
+
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(blocks[:, 0])[:, np.newaxis] * blocks[:-1, 2:5], 0)])
+    gyro = np.column_stack([np.interp(t, blocks[:, 0], integral[:, i]) for i in range(3)])
+    pairs, since = [], 0
+    for i in range(1, len(t)):
+        if t[i] - t[since] >= TURN_STEP:
+            pairs += [(since, i)] if t[i] - t[since] < 5.0 * TURN_STEP else []
+            since = i
+    if len(pairs) < TURN_PAIRS:
+        return
+    a, b = np.array(pairs).T
+    turned, gyro = _rotation(quaternions[a], quaternions[b]), gyro[b] - gyro[a]
+    # Half a turn and more is ambiguous.
+    clear = np.linalg.norm(turned, axis=1) < 2.5
+    turned, gyro = turned[clear], gyro[clear]
+    total = float(np.linalg.norm(turned, axis=1).sum())
+    if total < TURN_LEAST:
+        return
+    product, square = float(np.sum(turned * gyro)), float(np.sum(gyro**2))
+    agreement = product / math.sqrt(square * float(np.sum(turned**2)) + 1e-12)
+    times = square / product if product else math.inf
+    evidence = {"times": times, "correlation": agreement, "rotation_deg": math.degrees(total), "pairs": len(turned)}
+    if agreement > 0.8 and times > 20.0:
+        text = f"the gyroscope reads {times:.0f} x what the fixes turn: its unit is deg/s, not rad/s"
+        yield Diagnosis("gyro_unit", "error", text, evidence)
+    elif agreement < -0.8:
+        text = "the gyroscope turns the other way than the fixes: a sign, or the IMU is upside down"
+        yield Diagnosis("gyro_sign", "error", text, evidence)
+
+
+def _is_turned(fix: JudgedFix) -> bool:
+    outcome = fix.outcome
+    return outcome.outcome not in BELIEVED and float(np.linalg.norm(outcome.innovation[3:])) > TURNED_LEAST
+
+
+def _of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
+    """Fixes that are far off in attitude: alike about the vertical, or tipped as the other pose of a flat marker is."""
+    by_source: dict[str, list[Array]] = {}
+    count: dict[str, int] = {}
+    for fix in fixes:
+        outcome = fix.outcome
+        count[outcome.source] = count.get(outcome.source, 0) + 1
+        if _is_turned(fix):
+            by_source.setdefault(outcome.source, []).append(outcome.innovation[3:])
+    for source, turns in by_source.items():
+        name = f"camera {source}" if source else "the camera"
+        turn = np.array(turns)
+        angle = np.linalg.norm(turn, axis=1)
+        upright = np.abs(turn[:, 2]) / angle
+        about_z = turn[upright > 0.9, 2]
+        mean = np.mean(np.exp(1j * about_z)) if about_z.size else 0.0
+        if about_z.size >= TURNED_FIXES and abs(mean) >= TURNED_AGREE:
+            degrees = abs(math.degrees(float(np.angle(mean))))
+            text = (
+                f"{name} gives fixes turned by {degrees:.0f} deg: {about_z.size} of {count[source]} agree in that; "
+                "is a marker mounted or entered turned?"
+            )
+            evidence = {
+                "source": source,
+                "turn_deg": degrees,
+                "fixes": int(about_z.size),
+                "agreement": float(abs(mean)),
+            }
+            yield Diagnosis("fixes_turned", "warning", text, evidence)
+        tipped = angle[upright < 0.7]
+        if tipped.size >= TURNED_FIXES:
+            degrees = math.degrees(float(np.median(tipped)))
+            text = (
+                f"{name} shows the robot tipped by about {degrees:.0f} deg in {tipped.size / count[source]:.0%} of its "
+                "fixes: the other pose of a flat marker; a larger marker or a sharper image helps"
+            )
+            evidence = {"source": source, "tip_deg": degrees, "fixes": int(tipped.size), "of": count[source]}
+            yield Diagnosis("fixes_flipped", "note", text, evidence)
+
+
+def _of_cameras(fixes: Sequence[JudgedFix], axes: int) -> Iterator[Diagnosis]:
+    """Do fixes of different cameras agree that lie close together in time, but for the motion between them?"""
+    differences: dict[tuple[str, str], list[Array]] = {}
+    for a, b in pairwise(fixes):
+        if a.outcome.source == b.outcome.source or b.outcome.t - a.outcome.t > CAMERA_APART:
+            continue
+        # Between the published poses there must be no correction.
+        if a.published is None or b.published is None or a.used != b.used:
+            continue
+        step = (b.pose.position - a.pose.position) - (b.published[:3] - a.published[:3])
+        names = a.outcome.source, b.outcome.source
+        differences.setdefault((min(names), max(names)), []).append((step if names[0] < names[1] else -step)[:axes])
+    for (first, second), steps in differences.items():
+        step = np.array(steps)
+        middle = np.median(step, axis=0)
+        # sigma of a median from the median deviation: 1.2533 * 1.4826 / sqrt(n)
+        sigma = 1.86 * np.median(np.abs(step - middle), axis=0) / math.sqrt(len(step))
+        size = float(np.linalg.norm(middle))
+        sigmas = float(np.max(np.abs(middle) / np.maximum(sigma, 1e-6)))
+        if len(step) >= CAMERA_PAIRS and size >= CAMERA_LEAST and sigmas >= SIGMAS:
+            text = f"fixes of camera {second} disagree with those of camera {first} by {1e3 * size:.0f} mm"
+            evidence = {
+                "source": f"{first}, {second}", "mm": (1e3 * middle).tolist(), "sigma_mm": (1e3 * sigma).tolist(),
+                "pairs": len(step), "sigmas": sigmas,
+            }  # fmt: skip
+            yield Diagnosis("cameras_disagree", "warning", text, evidence)
+
+
+def _rotation(a: Array, b: Array) -> Array:
+    """(n, 3) rad: rotation vectors of conj(a) b, of quaternions wxyz (n, 4) each."""
+    w = np.sum(a * b, axis=1)
+    v = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
+    v = np.where(w[:, np.newaxis] < 0.0, -v, v)
+    n = np.linalg.norm(v, axis=1)
+    vector: Array = v * np.where(n > 1e-9, 2.0 * np.arctan2(n, np.abs(w)) / np.maximum(n, 1e-12), 2.0)[:, np.newaxis]
+    return vector

@@ -1,0 +1,262 @@
+"""How well a robot's localisation is: running figures, and what `fusion.diagnosis` says of it.
+
+`Health` looks on while a `Localiser` is fed and changes nothing. A sample costs it a row in a ring, a fix a look-up
+there; all else is done when it is asked. What it says is about the last two minutes.
+
+**Accuracy without ground truth.** A fix judges the pose that was published for its instant before the fix had arrived:
+the ring keeps what was published. The innovation would not do, since it is computed after rewinding, when fixes that
+arrived after the publication are in the state. The difference holds the fix's own error too, so that it errs to the
+safe side. Fixes that are not believed count when the filter gives in to them later, for then it was the pose that
+was wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fusion.consistency import chi2_bounds
+from fusion.diagnosis import BELIEVED, BLOCK, GAP, LEARNED_STEP, WINDOW, Chunk, Diagnosis, JudgedFix, Seen, diagnose
+from fusion.localiser import Localiser
+from fusion.measurements import Array, FixOutcome, Outcome, PoseFix, PoseHypothesis
+
+NIS_FIXES = 60  # fixes of the running NIS
+AGES = (0.2, 0.7, 1.7, 4.7)  # s: between the buckets of fix age; not the usual intervals of fixes themselves
+
+_KEEP = 4096  # rows that stay when the ring is full: the filter's own ring holds as many
+_T, _U, _PUBLISHED, _USED = 0, 1, 7, 15
+
+
+class Health:
+    """The figures of one robot. Tell it in this order, around feeding the localiser:
+
+    `arrived(fix)` before a fix is fed; `judged(outcomes)` after; `sampled(samples, track)` after samples are.
+    """
+
+    def __init__(self, localiser: Localiser) -> None:
+        self.localiser = localiser
+        self.reordered = 0
+        # By key: when it was first and last said, and how it was said last.
+        self.said: dict[tuple[str, str], tuple[float, float, Diagnosis]] = {}
+        self._planar = localiser.motion != "free"
+        self._rows = np.empty((2 * _KEEP, 16))
+        self._instants = self._rows[:, _PUBLISHED]
+        self._end = self._digested = 0
+        self._began = self._t_before = math.nan
+        self._last_fix = -math.inf
+        self._newest = -math.inf
+        self._chunks: deque[Chunk] = deque()
+        self._arriving: dict[tuple[str, float, float], tuple[PoseFix, Array | None, float]] = {}
+        self._fixes: deque[JudgedFix] = deque(maxlen=400)
+        self._learned: deque[tuple[float, Array]] = deque(maxlen=round(WINDOW / LEARNED_STEP))
+        self._late: deque[float] = deque(maxlen=400)
+        self._doubtful: deque[JudgedFix] = deque(maxlen=100)
+        self._accuracy: list[deque[JudgedFix]] = [deque(maxlen=400) for _ in range(len(AGES) + 1)]
+
+    # Looking on
+
+    def sampled(self, samples: Array, track: Array) -> None:
+        """Samples (n, 7) that were fed, and the track (n, 8) of it: what was published with each."""
+        for at in range(0, len(samples), _KEEP):
+            part, n = samples[at : at + _KEEP], min(_KEEP, len(samples) - at)
+            if self._end + n > len(self._rows):
+                self._digest()
+                self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
+                self._digested -= self._end - _KEEP
+                self._end = _KEEP
+            rows = self._rows[self._end : self._end + n]
+            rows[:, :_PUBLISHED] = part
+            rows[:, _PUBLISHED:_USED] = track[at : at + _KEEP]
+            rows[:, _USED] = self._last_fix
+            self._end += n
+        self._last_fix = self.localiser.last_fix
+
+    def arrived(self, fix: PoseFix) -> None:
+        """A fix that is about to be fed."""
+        if fix.t < self._newest:
+            self.reordered += 1
+        self._newest = max(self._newest, fix.t)
+        self._arriving[fix.source, fix.t, fix.arrival] = (fix, *self._published(fix.t + self.localiser.time_offset))
+        if len(self._arriving) > 256:
+            del self._arriving[next(iter(self._arriving))]
+
+    def judged(self, outcomes: Sequence[FixOutcome]) -> None:
+        """What the localiser made of fixes."""
+        for outcome in outcomes:
+            if outcome.outcome is Outcome.DUPLICATE:
+                continue
+            known = self._arriving.pop((outcome.source, outcome.t, outcome.arrival), None)
+            if outcome.outcome is Outcome.TOO_LATE:
+                self._late.append(outcome.arrival)
+            if known is None:
+                continue
+            fix, published, used = known
+            pose = fix.hypotheses[outcome.hypothesis]
+            self._score(JudgedFix(outcome, pose, published, used, *self._difference(pose, published)))
+            if not self._learned or abs(outcome.arrival - self._learned[-1][0]) >= LEARNED_STEP:
+                self._learned.append((outcome.arrival, self.localiser.noise_scale))
+        self._last_fix = self.localiser.last_fix
+
+    def _score(self, fix: JudgedFix) -> None:
+        self._fixes.append(fix)
+        outcome = fix.outcome.outcome
+        if outcome is Outcome.REJECTED:
+            self._doubtful.append(fix)
+            return
+        before = list(self._doubtful) if outcome is Outcome.REINITIALISED else []
+        self._doubtful.clear()
+        for scored in (*before, fix):
+            if scored.published is not None:
+                self._accuracy[bisect_left(AGES, scored.outcome.t - scored.used)].append(scored)
+
+    def _published(self, t: float) -> tuple[Array | None, float]:
+        """The pose (7,) that was published for instant t, and the last fix in it; None if there was none."""
+        after = bisect_left(self._instants, t, 0, self._end)
+        if not 0 < after < self._end:
+            return None, math.nan
+        a, b = self._rows[after - 1, _PUBLISHED:], self._rows[after, _PUBLISHED:]
+        span = b[0] - a[0]
+        if not (math.isfinite(a[1]) and span <= self.localiser.params.imu_gap):
+            return None, math.nan
+        # The quaternions of successive samples are nearly the same: a line will do.
+        pose: Array = a[1:8] + (t - a[0]) / span * (b[1:8] - a[1:8])
+        return pose, float(a[8])
+
+    def _difference(self, pose: PoseHypothesis, published: Array | None) -> tuple[float, float]:
+        """m and rad; on the floor, and about the vertical, for a robot that stays there."""
+        if published is None:
+            return math.nan, math.nan
+        x, y, z, pw, px, py, pz = published.tolist()
+        fx, fy, fz = pose.position.tolist()
+        qw, qx, qy, qz = pose.quaternion_wxyz.tolist()
+        w = pw * qw + px * qx + py * qy + pz * qz
+        c = pw * qz - pz * qw + py * qx - px * qy
+        if self._planar:
+            return math.hypot(fx - x, fy - y), 2.0 * math.atan2(abs(c), abs(w))
+        a, b = pw * qx - px * qw - py * qz + pz * qy, pw * qy - py * qw - pz * qx + px * qz
+        return math.hypot(fx - x, fy - y, fz - z), 2.0 * math.atan2(math.hypot(a, b, c), abs(w))
+
+    def _digest(self) -> None:
+        """Make a chunk of the rows since the last one."""
+        count = (self._end - self._digested) // BLOCK
+        if not count:
+            return
+        rows = self._rows[self._digested : self._digested + count * BLOCK]
+        self._digested += count * BLOCK
+        t = rows[:, _T]
+        if math.isnan(self._t_before):
+            self._began = self._t_before = float(t[0])
+            t = t[1:]
+        steps = np.diff(t, prepend=self._t_before)
+        self._t_before = float(t[-1])
+        forward = steps[steps > 0.0]
+        step = float(np.median(forward)) if forward.size else math.inf
+        long = steps[steps > GAP * step]
+        # Jittered stamps make long steps too, but short ones make up for those.
+        missing = max(0.0, min(float(np.sum(np.round(long / step) - 1.0)), float(forward.sum()) / step - len(steps)))
+        # One row an axis: reductions along what lies side by side in memory are several times as fast.
+        u = rows[:, _U:_PUBLISHED].T.copy()
+        size = np.abs(u)
+        top = size.max(axis=1)
+        at_top = np.count_nonzero(size >= (1.0 - 1e-6) * top[:, np.newaxis], axis=1)
+        near_top = np.count_nonzero(size >= 0.95 * top[:, np.newaxis], axis=1) - at_top
+        in_blocks = u.reshape(6, count, BLOCK)
+        first = np.diff(in_blocks)
+        third = np.diff(first, n=2)
+        means = (
+            in_blocks.mean(axis=2),
+            np.einsum("ijk,ijk->ij", first, first) / (2.0 * (BLOCK - 1)),
+            np.einsum("ijk,ijk->ij", third, third) / (20.0 * (BLOCK - 3)),
+        )
+        blocks = np.vstack([rows[::BLOCK, _T], rows[BLOCK - 1 :: BLOCK, _T], *means]).T
+        longest, repeats = float(long.max(initial=0.0)), int(np.sum(steps == 0.0))
+        chunk = Chunk(
+            self._t_before, len(steps), step, missing, len(long), longest, repeats, top, at_top, near_top, blocks
+        )
+        self._chunks.append(chunk)
+        while self._chunks[0].t < self._chunks[-1].t - WINDOW:
+            self._chunks.popleft()
+
+    # Figures
+
+    def figures(self, now: float) -> dict[str, Any]:
+        """Plain values; None where nothing is known. NIS is per degree of freedom, with its 95 % bounds."""
+        localiser = self.localiser
+        delays = [fix.outcome.delay for fix in self._fixes]
+        tilt_sigma = np.sqrt(np.diag(localiser.tilt_covariance))
+        age = now - localiser.last_fix
+        scored = [fix for bucket in self._accuracy for fix in bucket]
+        edges = (0.0, *AGES, None)
+        return {
+            "nis": {name: self._nis(name) for name in ("pose", "position", "attitude")},
+            "time_offset_ms": 1e3 * localiser.time_offset,
+            "time_offset_sigma_ms": 1e3 * localiser.time_offset_sigma,
+            "tilt_deg": np.degrees(localiser.tilt).tolist(),
+            "tilt_sigma_deg": np.degrees(tilt_sigma).tolist(),
+            "gyro_bias": localiser.gyro_bias.tolist(),
+            "gyro_bias_sigma": localiser.gyro_bias_sigma.tolist(),
+            "accel_bias": localiser.accel_bias.tolist(),
+            "accel_bias_sigma": localiser.accel_bias_sigma.tolist(),
+            "fix_age_s": age if math.isfinite(age) else None,
+            "fix_delay_ms": {"p50": _percentile(delays, 50, 1e3), "p95": _percentile(delays, 95, 1e3)},
+            "fixes_reordered": self.reordered,
+            "accuracy": _accuracy(scored)
+            | {
+                "by_fix_age": [
+                    {"from_s": edges[i], "to_s": edges[i + 1]} | _accuracy(bucket)
+                    for i, bucket in enumerate(self._accuracy)
+                ]
+            },
+        }
+
+    def _nis(self, name: str) -> dict[str, float | None]:
+        dof = 6 if name == "pose" else 3
+        d2 = self._d2(name)
+        if not d2:
+            return {"mean": None, "low": None, "high": None, "fixes": 0}
+        low, high = chi2_bounds(dof, len(d2))
+        return {"mean": float(np.mean(d2)) / dof, "low": low / dof, "high": high / dof, "fixes": len(d2)}
+
+    def _d2(self, name: str) -> list[float]:
+        attribute = "d2" if name == "pose" else f"d2_{name}"
+        believed = [fix.outcome for fix in self._fixes if fix.outcome.outcome in BELIEVED]
+        return [getattr(outcome, attribute) for outcome in believed[-NIS_FIXES:]]
+
+    # Diagnosis
+
+    def diagnoses(self, now: float) -> list[Diagnosis]:
+        """What there is to say at `now`, on the clock of the stamps; it is also entered in `said`."""
+        found = diagnose(self._seen(now))
+        for diagnosis in found:
+            since = self.said[diagnosis.key][0] if diagnosis.key in self.said else now
+            self.said[diagnosis.key] = since, now, diagnosis
+        return found
+
+    def _seen(self, now: float) -> Seen:
+        self._digest()
+        since = now - WINDOW
+        fixes = sorted((fix for fix in self._fixes if fix.outcome.arrival > since), key=lambda fix: fix.outcome.t)
+        lost = sum(arrival > since for arrival in self._late)
+        learned = [look for look in self._learned if look[0] > since]
+        return Seen(now, self.localiser, self._began, self._chunks, fixes, lost, learned)
+
+
+def _percentile(values: Sequence[float], percent: float, scale: float) -> float | None:
+    return scale * float(np.percentile(values, percent)) if values else None
+
+
+def _accuracy(scored: Sequence[JudgedFix] | deque[JudgedFix]) -> dict[str, Any]:
+    mm, deg = [fix.distance for fix in scored], [fix.angle for fix in scored]
+    degrees = math.degrees(1.0)
+    return {
+        "fixes": len(scored),
+        "mm_p50": _percentile(mm, 50, 1e3),
+        "mm_p95": _percentile(mm, 95, 1e3),
+        "deg_p50": _percentile(deg, 50, degrees),
+        "deg_p95": _percentile(deg, 95, degrees),
+    }
