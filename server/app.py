@@ -23,7 +23,7 @@ from email.utils import formatdate
 from importlib.metadata import version
 from importlib.resources import files
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, get_args
 from urllib.parse import parse_qsl, urlsplit
 
 import msgspec
@@ -35,6 +35,7 @@ from websockets.http11 import Request, Response
 
 from fusion.localiser import warm_up
 from fusion.measurements import Pose
+from fusion.params import Channel
 from imu.protocols import TIME_LIMIT
 from imu.protocols.csv_lines import CsvLines
 from imu.protocols.json_lines import JsonLines
@@ -86,7 +87,7 @@ _THERE_IS = (
     "There is:\n"
     "  GET        /           the page that shows the robots\n"
     "  GET        /healthz    health, as JSON\n"
-    "  WebSocket  /v1/poses   poses; ?robots=a,b&rate=50\n"
+    "  WebSocket  /v1/poses   poses; ?robots=a,b&rate=50&channel=best\n"
     "  WebSocket  /v1/robot   for a robot: IMU up, its pose down\n"
     "  WebSocket  /           marker sightings, as the original tracker sent them\n"
 )
@@ -332,8 +333,10 @@ class Service:
                     continue
                 if self._published is not None:
                     self._published(pose)
-                if self.hub.wants(f"pose/{name}"):
-                    messages[f"pose/{name}"] = robot.encode(pose, now)
+                if self.hub.wants(f"smooth/{name}"):
+                    messages[f"smooth/{name}"] = robot.encode(pose, now)
+                if self.hub.wants(f"best/{name}") and (best := robot.localiser.pose_at(now)) is not None:
+                    messages[f"best/{name}"] = robot.encode(best, now)
                 if self.hub.wants(f"own/{name}"):
                     messages[f"own/{name}"] = robot.encode_own(pose, now)
             self.hub.publish(now, messages)
@@ -448,13 +451,13 @@ class Service:
                 pass  # the original ignored what its clients sent
 
     async def _serve_poses(self, visitor: _Visitor, query: str) -> None:
-        robots, rate_hz = self._poses_query(query)
-        with self._client(visitor.connection, [f"pose/{robot}" for robot in robots], rate_hz):
+        robots, rate_hz, channel = self._poses_query(query)
+        with self._client(visitor.connection, [f"{channel}/{robot}" for robot in robots], rate_hz):
             async for _ in visitor.connection:
                 await self._refuse(visitor, MessageError("/v1/poses only sends; robots speak on /v1/robot"))
 
-    def _poses_query(self, query: str) -> tuple[list[str], float]:
-        robots, rate_hz = list(self.robots), self.config.server.pose_rate_hz
+    def _poses_query(self, query: str) -> tuple[list[str], float, str]:
+        robots, rate_hz, channel = list(self.robots), self.config.server.pose_rate_hz, "smooth"
         for key, value in parse_qsl(query, keep_blank_values=True):
             if key == "robots":
                 robots = [name for name in value.split(",") if name]
@@ -467,9 +470,13 @@ class Service:
                     rate_hz = math.nan
                 if not 0.0 < rate_hz <= 1000.0:
                     raise RefusedError(f"rate={value}: poses a second are needed, above 0 and up to 1000")
+            elif key == "channel":
+                channel = value
+                if channel not in get_args(Channel):
+                    raise RefusedError(f"channel={value}: there are {' and '.join(get_args(Channel))}")
             else:
-                raise RefusedError(f"{key}={value} is not known here; robots=a,b and rate=50 are")
-        return robots, rate_hz
+                raise RefusedError(f"{key}={value} is not known here; robots=a,b, rate=50 and channel=best are")
+        return robots, rate_hz, channel
 
     def _known(self, name: str) -> Robot:
         if name not in self.robots:

@@ -67,7 +67,8 @@ class PoseMessage(Struct, frozen=True, tag_field="type", tag="pose"):
     """A published pose. `t` and `published`: s of the service's monotonic clock; SI units, radians, frame `world`.
 
     `covariance`: 36 numbers, row by row, order and axes as in `fusion.measurements`. `fix_age` is null before the
-    first fix. `t_robot`: `t` in the robot's own clock, only on the way to that robot.
+    first fix. `reset_step`: by how much the pose stepped when `reset_id` rose last: m, then rotation vector, world
+    axes; absent before the first. `t_robot`: `t` in the robot's own clock, only on the way to that robot.
     """
 
     robot: str
@@ -84,6 +85,7 @@ class PoseMessage(Struct, frozen=True, tag_field="type", tag="pose"):
     mode: str
     reset_id: int
     fix_age: float | None
+    reset_step: list[float] | UnsetType = UNSET
     t_robot: float | UnsetType = UNSET
 
 
@@ -138,6 +140,7 @@ def pose_message(pose: Pose, published: float, seq: int, t_robot: float | None =
         mode=pose.mode.value,
         reset_id=pose.reset_id,
         fix_age=pose.fix_age if math.isfinite(pose.fix_age) else None,
+        reset_step=pose.reset_step.tolist() if pose.reset_id and pose.reset_step.any() else UNSET,
         t_robot=UNSET if t_robot is None else t_robot,
     )
 

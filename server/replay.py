@@ -17,7 +17,7 @@ from fusion.consistency import hold_last, track_error
 from fusion.health import Health
 from fusion.localiser import Localiser, warm_up
 from fusion.measurements import Array, FixOutcome, Outcome
-from fusion.params import Engine, FilterParams, Motion
+from fusion.params import Channel, Engine, FilterParams, Motion
 from server import config
 from server.recording import Recording, RecordingError, load, robot_folders, write_tum
 
@@ -35,27 +35,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", metavar="NAME", help="which robot of the configuration it is")
     parser.add_argument("--engine", choices=get_args(Engine), help="default: the robot's, else numba")
     parser.add_argument("--motion", choices=get_args(Motion), help="default: the robot's, else ground")
+    parser.add_argument(
+        "--channel",
+        choices=get_args(Channel),
+        default="best",
+        help="of the poses: the filter's (default), or jump-free",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
 
 
 def replay(
-    recording: Recording, localiser: Localiser, progress: Any = None, health: Health | None = None
+    recording: Recording,
+    localiser: Localiser,
+    progress: Any = None,
+    health: Health | None = None,
+    channel: Channel = "best",
 ) -> tuple[Array, list[FixOutcome], float]:
     """Feed a recording to a localiser in order of arrival, a fix before a sample that arrives with it.
 
     -> the causal track (n, 8), a row per IMU sample in order of arrival: its stamp, position, quaternion wxyz, NaN
-    before the first fix; the fixes' outcomes; the seconds that it took. `progress` is called with the number of
+    before the first fix; the fixes' outcomes; the seconds that the filter took. `progress` is called with the number of
     samples done; `health` looks on.
     """
     track = np.full((len(recording.samples), 8), np.nan)
     outcomes: list[FixOutcome] = []
     stops = np.searchsorted(recording.arrival, [fix.arrival for fix in recording.fixes], side="left")
     at = 0
-    began = time.perf_counter()
+    took = 0.0
 
     def feed_samples(stop: int) -> None:
-        localiser.feed_samples(recording.samples[at:stop], track[at:stop])
+        nonlocal took
+        began = time.perf_counter()
+        localiser.feed_samples(recording.samples[at:stop], track[at:stop], channel)
         judged = localiser.judged()
+        took += time.perf_counter() - began
         outcomes.extend(judged)
         if health is not None:
             health.judged(judged)
@@ -73,14 +86,16 @@ def replay(
                 health.diagnoses(fix.arrival)
                 due = fix.arrival + DIAGNOSE_EVERY
             health.arrived(fix)
+        began = time.perf_counter()
         judged = localiser.feed(fix)
+        took += time.perf_counter() - began
         outcomes += judged
         if health is not None:
             health.judged(judged)
     feed_samples(len(recording.samples))
     if health is not None:
         health.diagnoses(_end(recording))
-    return track, outcomes, time.perf_counter() - began
+    return track, outcomes, took
 
 
 def _end(recording: Recording) -> float:
@@ -194,7 +209,9 @@ def run(args: argparse.Namespace) -> int:
         with tqdm(
             total=len(recording.samples), unit=" samples", delay=1.0, leave=False, disable=not sys.stderr.isatty()
         ) as bar:
-            result = replay(recording, health.localiser, lambda done, bar=bar: bar.update(done - bar.n), health)
+            result = replay(
+                recording, health.localiser, lambda done, bar=bar: bar.update(done - bar.n), health, args.channel
+            )
         track, _, _ = result
         figures = summary(recording, health, *result)
         print(json.dumps(figures) if args.json else _table(figures))

@@ -89,8 +89,8 @@ class Robot:
         self.vitals.judged(self.localiser.feed(fix))
 
     def publish(self, now: float) -> Pose | None:
-        """The pose for this instant; None before the first fix."""
-        pose = self.localiser.pose_at(now)
+        """The pose for this instant, as robots steer by it; None before the first fix."""
+        pose = self.localiser.pose_at(now, "smooth")
         if pose is not None:
             self.published += 1
         return pose
