@@ -35,6 +35,7 @@ REST_RESIDUALS = 30  # components of fixes at rest that their noise is taken fro
 REST_SIGMAS = 4.0
 STILL_RATE, STILL_FORCE = 0.02, 0.15  # rad/s, m/s2: a block at rest turns less, and differs less from the one before
 LEARNED_STEP, LEARNED_SPAN, LEARNED_LEAST = 0.25, 40.0, 2.0  # s between looks, s, times the IMU's noise
+PART_OF_FIX, PART_OF_IMU = 0.05, 0.2  # of the variance of an innovation, to learn about the one or the other
 TURNED_LEAST, TURNED_FIXES, TURNED_AGREE = math.radians(20.0), 8, 0.97  # agreement: length of the mean unit vector
 CAMERA_PAIRS, CAMERA_LEAST, CAMERA_APART = 10, 0.005, 0.25  # number, m, s
 MISSING_LEAST, GAPS_LEAST, GAP = 0.01, 5, 1.75  # share, number, times the usual step
@@ -133,7 +134,7 @@ def diagnose(seen: Seen) -> list[Diagnosis]:
         return [diagnosis for diagnosis in found if diagnosis.code in _ROOTS or diagnosis.code in _BESIDES]
     odd = [*_of_turns(fixes), *_of_cameras(fixes, 2 if planar else 3)]
     if not odd:
-        found += _of_learned(seen.learned, codes)
+        found += _of_learned(seen, codes)
     # Where noise is understated, so are the filter's sigmas.
     understated = max([1.0, *(diagnosis.evidence["times"] for diagnosis in found if "noise" in diagnosis.code)])
     return [*found, *odd, *_of_states(seen.localiser, understated)]
@@ -278,23 +279,34 @@ def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
                 yield Diagnosis(f"fix_{block}_noise", "warning", text, evidence)
 
 
-def _of_learned(learned: Sequence[tuple[float, Array]], known: set[str]) -> Iterator[Diagnosis]:
+def _of_learned(seen: Seen, known: set[str]) -> Iterator[Diagnosis]:
     """What noise the filter has learned, where no more direct test has found it."""
-    seconds = learned[-1][0] - learned[0][0] if learned else 0.0
-    if seconds < LEARNED_SPAN:
+    looks = seen.learned
+    seconds = looks[-1][0] - looks[0][0] if looks else 0.0
+    judged = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2)]
+    if seconds < LEARNED_SPAN or not judged:
         return
-    accel, gyro, *fix = np.median([scale for _, scale in learned], axis=0).tolist()
-    for block, times in zip(("position", "attitude"), fix, strict=True):
-        if times >= NOISE_LEAST and f"fix_{block}_noise" not in known:
+    accel, gyro, position, attitude = np.median([scale for _, scale in looks], axis=0).tolist()
+    # What an innovation is made of: where the prediction has next to no part in it, it says nothing of the IMU, and
+    # what is learned of that wanders; and the same of fixes.
+    of_fix = np.array([np.diag(fix.pose.covariance) for fix in judged]).reshape(-1, 2, 3).sum(axis=2)
+    of_all = np.array([fix.outcome.innovation_sigma**2 for fix in judged]).reshape(-1, 2, 3).sum(axis=2)
+    parts = np.median(of_fix / of_all, axis=0).tolist()
+    noise = any("noise" in code for code in known)
+    for block, times, part in zip(("position", "attitude"), (position, attitude), parts, strict=True):
+        if times >= NOISE_LEAST and times**2 * part >= PART_OF_FIX and f"fix_{block}_noise" not in known:
             text = f"fixes are about {times:.1f} x less accurate in {block} than they say, or their stamps jitter"
             yield Diagnosis(f"fix_{block}_noise", "warning", text, {"times": times, "seconds": seconds})
-            known.add("noise")
+            noise = True
     # Of the two sensors one can get the blame for the other, or for fixes.
-    if not any("noise" in code for code in known):
-        for name, sensor, times in (("accel", "accelerometer", accel), ("gyro", "gyroscope", gyro)):
-            if times >= LEARNED_LEAST:
-                text = f"in motion the {sensor} is about {times:.1f} x worse than configured: vibration, or its scale"
-                yield Diagnosis(f"{name}_motion", "warning", text, {"times": times, "seconds": seconds})
+    if noise:
+        return
+    for name, sensor, times, part in zip(
+        ("accel", "gyro"), ("accelerometer", "gyroscope"), (accel, gyro), parts, strict=True
+    ):
+        if times >= LEARNED_LEAST and 1.0 - part >= PART_OF_IMU:
+            text = f"in motion the {sensor} is about {times:.1f} x worse than configured: vibration, or its scale"
+            yield Diagnosis(f"{name}_motion", "warning", text, {"times": times, "seconds": seconds})
 
 
 def _residuals(t: Array, fixes: Sequence[JudgedFix]) -> Array:
