@@ -76,7 +76,9 @@ STILL_SURE = AUX + 58  # 1 where rest and motion differ in that
 USUAL_SPEED2 = AUX + 59  # (m/s)^2: mean squared speed along an axis while the robot moves
 REJECTED_RUN = AUX + 66  # rejects since the last accepted fix
 CORRECTED = AUX + 60  # sum of all moves by updates, world axes: position (3), rotation vector (3)
-STATE = AUX + 67
+ADAPTED = AUX + 67  # fixes that the noise has learnt from, of those in quick succession a part
+T_ADAPTED = AUX + 68  # s: the last of them
+STATE = AUX + 69
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -163,6 +165,7 @@ SMOOTH_SPEED, SMOOTH_RATE = 0.3, math.radians(60.0)  # m/s, rad/s: but not faste
 SMOOTH_DISTANCE, SMOOTH_ANGLE = 0.25, math.radians(20.0)  # m, rad: and beyond this the channel steps, and says so
 SMOOTH_REACH = 0.5  # s: so far ahead of the newest input a published pose is kept from moving
 OUTLIER_DISTANCE = 0.15  # m: a fix that is rejected by less tells of noise, not of a mistake
+ADAPTATION_HZ = 2.0  # fixes more often than this share their say in the noise
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
 STILL_SPEED_SIGMA = 0.01  # m/s
@@ -620,6 +623,12 @@ def _adapt(s, prm, figures, most):
     one another (the filter lags behind), noise understated in the fixes ones that alternate (it follows them too far):
     R. Mehra, "Approaches to adaptive filtering", IEEE TAC 17(5), 1972. By that the blame is laid.
     """
+    # The first fixes teach more: a start that believes them too much runs away within seconds.
+    # Of a fast camera each teaches less, since its innovations hardly know the process and would let it wander.
+    weight = min(max((s[T] - s[T_ADAPTED]) * ADAPTATION_HZ, 0.0), 1.0)
+    gain = weight * prm[ADAPTATION] * max(1.0, 20.0 / (s[ADAPTED] + 6.0))
+    s[ADAPTED] += weight
+    s[T_ADAPTED] = s[T]
     for block in range(2):
         d2, product, length = 0.0, 0.0, 0.0
         for i in range(3 * block, 3 * block + 3):
@@ -634,7 +643,7 @@ def _adapt(s, prm, figures, most):
         for k in range(2):
             i = EXCESS + block + 2 * k
             part = to_process if k == 0 else 1.0 - to_process
-            s[i] = min(max(s[i] + prm[ADAPTATION] * part * more, -1.0), 8.0)
+            s[i] = min(max(s[i] + gain * part * more, -1.0), 8.0)
             factor = math.exp(max(s[i] - 0.7, 0.0))
             s[SCALE + block + 2 * k] = math.sqrt(factor) if k == 0 else factor
 
@@ -821,7 +830,7 @@ def _constrain(s, prm):
     still_sigma = STILL_SPEED_SIGMA if s[STILL_SURE] > 0.0 else 3.0 * STILL_SPEED_SIGMA
     wheels = prm[MOTION] == DIFFERENTIAL
     for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-        m = 0
+        m, sideways = 0, 0
         H, y, R = np.zeros((9, N)), np.zeros(9), np.zeros((9, 9))
         _matrix(s, o, B)
         # along body axes: v_b = Rᵀv, δv_b = δv + [v_b]x δθ
@@ -833,9 +842,13 @@ def _constrain(s, prm):
                 variance = still_sigma * still_sigma
             elif wheels and i == 1:
                 variance = _loosened(prm[WHEEL_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS + 3], body[1])
+                sideways = m
             else:
                 # one in each 2 x SPEED_TIME is independent of the one before
                 variance = max(s[USUAL_SPEED2], LEAST_SPEED * LEAST_SPEED) * 2.0 * SPEED_TIME * GRID_HZ
+                # a speed that is known a thousand times better learns nothing from this
+                if s[o + COV + (N + 1) * (DV + i)] < 1e-3 * variance:
+                    continue
             y[m] = -body[i]
             R[m, m] = variance
             H[m, DV + i] = 1.0
@@ -866,7 +879,7 @@ def _constrain(s, prm):
         if o == MAIN and prm[MOTION] != FREE and not still:
             first = m - 3
             for i in range(4 if wheels else 3):
-                a = first + i if i < 3 else 1
+                a = first + i if i < 3 else sideways
                 expected = R[a, a]
                 for c in range(N):
                     for d in range(N):
@@ -875,7 +888,8 @@ def _constrain(s, prm):
                 # relative to the constraint as it was meant
                 loose = max(s[CONSTRAINT_NIS + i], 1.0)
                 s[CONSTRAINT_NIS + i] += 0.05 * (min(y[a] * y[a] / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
-        update(s, o, H[:m], y[:m], R[:m, :m])
+        if m > 0:
+            update(s, o, H[:m], y[:m], R[:m, :m])
 
 
 # -------------------------------------------------------------------------------------------------------- timeline
@@ -1378,7 +1392,7 @@ def new_memory(parameters: Array) -> Array:
     meta[HORIZON] = state[T] = state[T_IMU] = state[T_ACCEPTED] = -math.inf
     channel[E_PUBLISHED] = -math.inf
     state[STILL_SINCE] = math.inf
-    state[STILL_BARRED] = -math.inf
+    state[STILL_BARRED] = state[T_ADAPTED] = -math.inf
     state[SCALE : SCALE + 4] = 1.0
     state[USUAL_SPEED2] = prm[USUAL_SPEED] ** 2
     checkpoints[0] = state

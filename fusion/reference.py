@@ -186,6 +186,7 @@ class _State:
         self.still_since, self.still_barred, self.still_sure, self.still_fixes = math.inf, -math.inf, False, 0
         self.still_mean, self.rest, self.moving = np.zeros(3), np.zeros(2), np.zeros(2)
         self.constraint_nis, self.usual_speed2 = np.zeros(4), 0.0
+        self.adapted, self.t_adapted = 0.0, -math.inf
 
     def copy(self) -> _State:
         other = copy.copy(self)
@@ -236,6 +237,7 @@ class ReferenceTimeline:
         vector[k.COV : k.COV + N * N] = s.main.P.ravel()
         vector[k.T], vector[k.T_IMU], vector[k.T_ACCEPTED] = s.t, s.t_imu, s.t_accepted
         vector[k.INITIALISED], vector[k.RESET_ID] = s.initialised, s.reset_id
+        vector[k.SCALE : k.SCALE + 4] = s.scale
         return vector
 
     def feed_samples(self, samples: Array, track: Array | None = None, channel: Channel = "best") -> int:
@@ -536,6 +538,10 @@ class ReferenceTimeline:
         e = figures[k.F_INNOVATION - k.F_D2 :][:6] / figures[k.F_SIGMA - k.F_D2 :][:6]
         before, state.last_innovation = state.last_innovation, e
         state.excess, state.scale = state.excess.copy(), state.scale.copy()
+        weight = min(max((state.t - state.t_adapted) * k.ADAPTATION_HZ, 0.0), 1.0)
+        gain = weight * self._params.adaptation * max(1.0, 20.0 / (state.adapted + 6.0))
+        state.adapted += weight
+        state.t_adapted = state.t
         for block, half in enumerate((slice(0, 3), slice(3, 6))):
             d2 = float(e[half] @ e[half])
             length = float(before[half] @ before[half])
@@ -543,7 +549,7 @@ class ReferenceTimeline:
             more = min(d2 / 3.0 - 1.0, most)
             to_process = min(max(0.5 + follows, 0.0), 1.0)
             for i, part in ((block, to_process), (block + 2, 1.0 - to_process)):
-                excess = float(state.excess[i]) + self._params.adaptation * part * more
+                excess = float(state.excess[i]) + gain * part * more
                 state.excess[i] = min(max(excess, -1.0), 8.0)
                 factor = math.exp(max(state.excess[i] - 0.7, 0.0))
                 state.scale[i] = math.sqrt(factor) if i < 2 else factor
@@ -671,13 +677,17 @@ class ReferenceTimeline:
             return max(sigma**2 * max(float(state.constraint_nis[i]), 1.0), float(y * y))
 
         body = f.rotation.T @ f.velocity
-        H = np.zeros((9, N))
-        H[:3, DV], H[:3, TH] = _I3, skew(body)
         usual = max(state.usual_speed2, k.LEAST_SPEED**2) * 2.0 * k.SPEED_TIME * k.GRID_HZ
         variances = [(factor * k.STILL_SPEED_SIGMA) ** 2 if still else usual] * 3
         if wheels and not still:
             variances[1] = loosened(p.wheel_velocity_sigma, 3, body[1])
-        y = list(-body)
+        # a speed that is known a thousand times better learns nothing from what is usual
+        known = np.diag(f.P)[DV] < 1e-3 * usual
+        axes = [i for i in range(3) if still or (wheels and i == 1) or not known[i]]
+        H = np.zeros((len(axes) + 6, N))
+        H[: len(axes), DV], H[: len(axes), TH] = _I3[axes], skew(body)[axes]
+        y = list(-body[axes])
+        variances = [variances[i] for i in axes]
         if still:
             H[3:6, DBG] = _I3
             y += list(state.still_mean - f.gyro_bias)
@@ -693,11 +703,12 @@ class ReferenceTimeline:
         m = len(y)
         if f is state.main and ground and not still:
             state.constraint_nis = state.constraint_nis.copy()
-            for i, row in enumerate([m - 3, m - 2, m - 1, 1] if wheels else [m - 3, m - 2, m - 1]):
+            for i, row in enumerate([m - 3, m - 2, m - 1, axes.index(1)] if wheels else [m - 3, m - 2, m - 1]):
                 expected = variances[row] + H[row] @ f.P @ H[row]
                 now = min(y[row] ** 2 / expected, 9.0) * max(state.constraint_nis[i], 1.0)
                 state.constraint_nis[i] += 0.05 * (now - state.constraint_nis[i])
-        f.correct(H[:m], np.array(y), np.diag(variances))
+        if m:
+            f.correct(H[:m], np.array(y), np.diag(variances))
 
     def _pose(self, state: _State) -> Array:
         f = state.main
