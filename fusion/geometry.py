@@ -23,21 +23,26 @@ _SMALL = 1e-4
 
 def skew(v: ArrayLike) -> Array:
     """(3, 3) with `skew(a) @ b == cross(a, b)`."""
-    x, y, z = np.asarray(v, dtype=np.float64)
+    x, y, z = np.asarray(v, dtype=np.float64).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def exp_so3(rotation_vector: ArrayLike) -> Array:
-    """Rotation vector (3,), rad -> rotation (3, 3). Rodrigues' formula [132]."""
-    v = np.asarray(rotation_vector, dtype=np.float64)
-    angle = float(np.linalg.norm(v))
+    """Rotation vector (3,), rad -> rotation (3, 3). Rodrigues' formula [132]: I + a [v]x + b [v]x²."""
+    x, y, z = np.asarray(rotation_vector, dtype=np.float64).tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
     if angle < _SMALL:
         a, b = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0
     else:
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
-    K = skew(v)
-    R: Array = np.eye(3) + a * K + b * (K @ K)
-    return R
+    # in scalars, which is several times as fast
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def log_so3(R: ArrayLike) -> Array:

@@ -48,25 +48,29 @@ class Smoother:
         """Before the first fix there is nothing to smooth."""
         self._t = t
 
-    def _left(self, dt: float) -> Array:
-        left = np.ones(2)
-        if dt <= 0.0:
-            return left
-        for i, most in enumerate((k.SMOOTH_SPEED, k.SMOOTH_RATE)):
-            size = float(np.linalg.norm(self._e[3 * i : 3 * i + 3]))
-            if size > 0.0:
-                left[i] = 1.0 - min(1.0 - math.exp(-dt / k.SMOOTH_TIME), most * dt / size)
-        return left
-
     def offset(self, t: float) -> Array:
         """(6,): what is left of E at t."""
-        offset: Array = self._e * np.repeat(self._left(t - self._t), 3)
-        return offset
+        dt = t - self._t
+        if dt <= 0.0:
+            return self._e
+        e = self._e.tolist()
+        decayed = 1.0 - math.exp(-dt / k.SMOOTH_TIME)
+        left = []
+        for size, most in ((math.hypot(*e[:3]), k.SMOOTH_SPEED), (math.hypot(*e[3:]), k.SMOOTH_RATE)):
+            share = 1.0 - (min(decayed, most * dt / size) if size > 0.0 else 0.0)
+            left += [share, share, share]
+        return self._e * left
 
     def publish(self, t: float) -> Array:
         """`offset`, and from now on the pose at t is kept from moving."""
         self._published = max(self._published, t)
         return self.offset(t)
+
+    def glide(self, t: float) -> None:
+        """Let E decay until t, when nothing moves the pose but the IMU."""
+        if t > self._t:
+            self._e = self.offset(t)
+            self._t = t
 
     def absorb(self, before: Motion, after: Motion, corrected: Array | None) -> None:
         """Take what an input has done to the filter's pose into E.
@@ -77,9 +81,7 @@ class Smoother:
         at = after.t
         if corrected is None:
             at = min(max(self._published, after.t), after.t + k.SMOOTH_REACH)
-        if at > self._t:
-            self._e = self.offset(at)
-            self._t = at
+        self.glide(at)
         if corrected is not None:
             self._e = self._e - corrected
         else:

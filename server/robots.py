@@ -10,7 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fusion.health import Diagnosis, Health
+from fusion.diagnosis import Diagnosis
+from fusion.health import Health
 from fusion.localiser import Localiser
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix
 from imu.clock import DeviceClock
