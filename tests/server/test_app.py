@@ -140,6 +140,29 @@ def test_poses_of_all_robots_or_of_some() -> None:
     run(main)
 
 
+def test_the_smooth_channel_is_published_and_the_best_one_on_request() -> None:
+    async def main() -> None:
+        async with (
+            serving() as service,
+            client(service, "/v1/poses?robots=rover&channel=best") as best,
+            client(service, "/v1/poses?robots=rover&channel=smooth") as smooth,
+        ):
+            rover = service.robots["rover"]
+            now = time.monotonic()
+            rover.feed_fix(replace(fix("rover", 1.0), t=now - 0.2), now)
+            rover.publish(now)
+            rover.feed_fix(replace(fix("rover", 1.1), t=now - 0.1), now)
+            # without any time between: the one has moved, the other not yet
+            published, moved = rover.publish(now), rover.localiser.pose_at(now)
+            assert published is not None
+            assert moved is not None
+            assert published.position[0] == pytest.approx(1.0, abs=1e-3)
+            assert moved.position[0] > 1.05
+            assert (await heard(best, "pose"))["robot"] == (await heard(smooth, "pose"))["robot"] == "rover"
+
+    run(main)
+
+
 @pytest.mark.parametrize(
     ("query", "expected"),
     [
@@ -147,7 +170,8 @@ def test_poses_of_all_robots_or_of_some() -> None:
         ("rate=fast", "rate=fast"),
         ("rate=-1", "rate=-1"),
         ("rate=nan", "rate=nan"),
-        ("format=msgpack", "robots=a,b and rate=50 are"),
+        ("channel=rough", "channel=rough: there are best and smooth"),
+        ("format=msgpack", "robots=a,b, rate=50 and channel=best are"),
     ],
 )
 def test_poses_that_cannot_be_had(query: str, expected: str) -> None:
