@@ -9,8 +9,8 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-# All matrices here are small: BLAS threads for them only fight over the cores (25 ms a frame on two busy ones). Read when
-# numpy is imported, which is why it stands here; a user's own setting goes before it.
+# All matrices here are small: BLAS threads for them only fight over the cores (25 ms a frame on two busy ones). numpy
+# reads it when it is imported, hence this place; a user's own setting stays.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Imported only when asked for: `steadfix detect` must not wait for the filter's compiler.
