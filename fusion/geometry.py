@@ -58,7 +58,7 @@ def log_so3(R: ArrayLike) -> Array:
 
 def rotation_from_quaternion(quaternion_wxyz: ArrayLike) -> Array:
     """Unit quaternion (4,) -> rotation (3, 3)."""
-    w, x, y, z = np.asarray(quaternion_wxyz, dtype=np.float64)
+    w, x, y, z = np.asarray(quaternion_wxyz, dtype=np.float64).tolist()
     return np.array(
         [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],

@@ -64,8 +64,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.rotation = np.eye(3)
         self.velocity = np.zeros(3)
         self.position = np.zeros(3)
-        self.gyro_bias = np.zeros(3)
-        self.accel_bias = np.zeros(3)
+        self.bias = np.zeros(6)  # of the IMU's sample: gyro, accel
         self.time_offset = 0.0
         self.lean(np.zeros(2))
         self.corrected = np.zeros(6)  # sum of all moves by updates: position, rotation vector, world axes
@@ -81,28 +80,40 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.up = np.array([x, y, z])
         self.up_by_tilt = np.array([[1.0, 0.0], [0.0, 1.0], [-x / z, -y / z]])
 
-    def move(self, gyro: Array, accel: Array, dt: float, noise: tuple[float, float, float, float]) -> None:
-        """Carry over `dt` s of constant rate and specific force; `noise`: densities of gyro, accel and their walks."""
-        turn = (gyro - self.gyro_bias) * dt
-        half_turned = exp_so3(0.5 * turn)
+    @property
+    def gyro_bias(self) -> Array:
+        return self.bias[:3]
+
+    def move(self, u: Array, dt: float, noise: tuple[float, float, float, float]) -> None:
+        """Carry over `dt` s of constant rate and specific force u (6,), with its bias.
+
+        `noise`: densities of gyro, accel and their walks.
+        """
+        du = (u - self.bias) * dt
+        half_turned = exp_so3(0.5 * du[:3])
         turned = half_turned.dot(half_turned)
-        added = half_turned.dot(accel - self.accel_bias) * dt  # Δv, in start axes
+        added = half_turned.dot(du[3:])  # Δv, in start axes
+        start, velocity = self.rotation, self.velocity
+        self.rotation = start.dot(turned)
+        self.velocity = velocity + start.dot(added) - GRAVITY * dt * self.up
+        self.position = self.position + 0.5 * dt * (velocity + self.velocity)
+
+        A = turned.T  # end axes from start axes
+        A_dt = dt * A
         F = _I.copy()
-        F[TH, DBG] = F[DV, DBA] = -dt * _I3
-        F[DV, TH] = -skew(added)
+        F[TH, TH] = F[DV, DV] = A
+        F[TH, DBG] = F[DV, DBA] = -A_dt
+        F[DV, TH] = A.dot(skew(-added))
         F[DV, DTILT] = -GRAVITY * dt * self.rotation.T.dot(self.up_by_tilt)
-        F[DP] += 0.5 * dt * (_I[DV] + F[DV])  # by the mean of the velocities before and after
-        for rows in (TH, DV, DP):
-            F[rows] = turned.T.dot(F[rows])  # into end axes
-        angle, force, gyro_walk, accel_walk = (density * density * dt for density in noise)
-        variances = np.array([angle, force, 0.5 * dt * force, dt * dt / 3.0 * force, gyro_walk, accel_walk])
+        F[DP] = 0.5 * dt * F[DV]  # the position goes by the mean of both velocities
+        F[DP, DV] = A_dt
+        F[DP, DP] = A
+        gyro_noise, accel_noise, gyro_walk, accel_walk = noise
+        force = accel_noise**2 * dt
+        carried = [0.5 * dt * force, dt * dt / 3.0 * force]
+        variances = np.array([gyro_noise**2 * dt, force, *carried, gyro_walk**2 * dt, accel_walk**2 * dt])
         self.F, self.Q = F, variances.dot(_NOISE).reshape(N, N)
         self.predict()
-
-        kick = self.rotation.dot(added) - GRAVITY * dt * self.up
-        self.position = self.position + (self.velocity + 0.5 * kick) * dt
-        self.velocity = self.velocity + kick
-        self.rotation = self.rotation.dot(turned)
 
     def correct(self, H: Array, y: Array, R: Array) -> None:
         """Update with innovation y, then move the nominal state by the error and reset it."""
@@ -114,8 +125,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.corrected = self.corrected + np.concatenate([moved, turned])
         self.velocity = self.velocity + faster
         self.position = self.position + moved
-        self.gyro_bias = self.gyro_bias + dx[DBG]
-        self.accel_bias = self.accel_bias + dx[DBA]
+        self.bias = self.bias + dx[9:15]
         self.time_offset += float(dx[15])
         self.lean(self.tilt + dx[DTILT])
         # Jr(φ) = I - (1 - cos φ)/φ² [φ]x + (φ - sin φ)/φ³ [φ]x²
@@ -129,8 +139,9 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         J[DV, DV] = J[DP, DP] = exp.T
         P = J.dot(self.P).dot(J.T)
         self.P = 0.5 * (P + P.T)
-        # through the quaternion, which keeps the rotation one
-        self.rotation = rotation_from_quaternion(quaternion_from_rotation(self.rotation.dot(exp)))
+        # A step of Newton's towards Rᵀ R = I keeps the rotation one.
+        R = self.rotation.dot(exp)
+        self.rotation = R.dot(1.5 * _I3 - 0.5 * R.T.dot(R))
 
     def start(self, hypothesis: Array, velocity_sigma: float) -> None:
         """Pose and its covariance from a fix; biases, time offset and tilt stay, uncorrelated with it."""
@@ -148,7 +159,8 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _in_body(self, hypothesis: Array) -> Array:
         """(6, 6): a fix's covariance in body axes."""
-        turn = np.kron(np.eye(2), self.rotation.T)
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = self.rotation.T
         R: Array = turn @ hypothesis[k.H_COV : k.H_COV + 36].reshape(6, 6) @ turn.T
         return R
 
@@ -189,9 +201,9 @@ class _State:
         self.td_applied = 0.0
         self.reset_id = self.accepted_count = 0
         self.accel_mean, self.accel_count = np.zeros(3), 0
-        self.excess, self.scale, self.last_innovation = np.zeros(4), np.ones(4), np.zeros(6)
+        self.excess, self.scale, self.last_innovation = [0.0] * 4, [1.0] * 4, np.zeros(6)
         self.still_since, self.still_barred, self.still_sure, self.still_fixes = math.inf, -math.inf, False, 0
-        self.still_mean, self.rest, self.moving = np.zeros(3), np.zeros(2), np.zeros(2)
+        self.still_mean, self.rest, self.moving = np.zeros(3), [0.0, 0.0], [0.0, 0.0]  # of gyro and accelerometer
         self.constraint_nis, self.usual_speed2 = np.zeros(4), 0.0
         self.adapted, self.t_adapted = 0.0, -math.inf
 
@@ -237,8 +249,7 @@ class ReferenceTimeline:
         vector[k.Q : k.Q + 4] = quaternion_from_rotation(s.main.rotation)
         vector[k.V : k.V + 3] = s.main.velocity
         vector[k.POS : k.POS + 3] = s.main.position
-        vector[k.BG : k.BG + 3] = s.main.gyro_bias
-        vector[k.BA : k.BA + 3] = s.main.accel_bias
+        vector[k.BG : k.BG + 3], vector[k.BA : k.BA + 3] = s.main.bias[:3], s.main.bias[3:]
         vector[k.TD] = s.main.time_offset
         vector[k.TILT : k.TILT + 2] = s.main.tilt
         vector[k.COV : k.COV + N * N] = s.main.P.ravel()
@@ -462,13 +473,13 @@ class ReferenceTimeline:
                 mean = 0.5 * (state.u + ahead)
                 for f in state.filters if state.initialised else []:
                     if state.bridging:
-                        force = f.accel_bias + GRAVITY * f.rotation.T @ f.up
+                        force = GRAVITY * f.rotation.T @ f.up
                         noise = (p.no_imu_rate_noise, p.no_imu_accel_noise, p.gyro_bias_walk, p.accel_bias_walk)
-                        f.move(f.gyro_bias, force, dt, noise)
+                        f.move(f.bias + np.concatenate([np.zeros(3), force]), dt, noise)
                     else:
                         white = (p.gyro_noise * state.scale[1], p.accel_noise * state.scale[0])
                         noise = (*white, p.gyro_bias_walk, p.accel_bias_walk)
-                        f.move(mean[:3], mean[3:], dt, noise)
+                        f.move(mean, dt, noise)
                 state.u = ahead
                 state.t = t
             if fix is None:
@@ -519,14 +530,15 @@ class ReferenceTimeline:
     def _weigh(self, state: _State, f: ErrorStateFilter, fix: Array) -> tuple[Array, Array, Array, Array]:
         """Choose the hypothesis, write the fix's figures. -> H, y, R, S."""
         rate = np.zeros(3) if state.bridging else state.u[:3] - f.gyro_bias
-        scores = []
+        scores, models = [], []
         for i in range(int(fix[k.F_COUNT])):
             H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
+            models.append((H, y, R))
             S = H @ f.P @ H.T + self._rescaled(state, R)
             scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
         chosen = int(np.argmin(scores))
         margin = abs(scores[0] - scores[1]) if len(scores) == 2 else math.inf
-        H, y, R = f.fix_model(self._hypothesis(fix, chosen), rate, self._params.stamp_jitter)
+        H, y, R = models[chosen]
         if margin < self._params.hypothesis_margin:
             B = f.rotation
             R[3:, 3:] += k.UNKNOWN_TILT_SIGMA**2 * (np.outer(B[0], B[0]) + np.outer(B[1], B[1]))
@@ -552,7 +564,7 @@ class ReferenceTimeline:
         """See `kernels._adapt`."""
         e = figures[k.F_INNOVATION - k.F_D2 :][:6] / figures[k.F_SIGMA - k.F_D2 :][:6]
         before, state.last_innovation = state.last_innovation, e
-        state.excess, state.scale = state.excess.copy(), state.scale.copy()
+        state.excess, state.scale = list(state.excess), list(state.scale)
         weight = min(max((state.t - state.t_adapted) * k.ADAPTATION_HZ, 0.0), 1.0)
         gain = weight * self._params.adaptation * max(1.0, 20.0 / (state.adapted + 6.0))
         state.adapted += weight
@@ -564,7 +576,7 @@ class ReferenceTimeline:
             more = min(d2 / 3.0 - 1.0, most)
             to_process = min(max(0.5 + follows, 0.0), 1.0)
             for i, part in ((block, to_process), (block + 2, 1.0 - to_process)):
-                excess = float(state.excess[i]) + gain * part * more
+                excess = state.excess[i] + gain * part * more
                 state.excess[i] = min(max(excess, -1.0), 8.0)
                 factor = math.exp(max(state.excess[i] - 0.7, 0.0))
                 state.scale[i] = math.sqrt(factor) if i < 2 else factor
@@ -657,21 +669,23 @@ class ReferenceTimeline:
         still = False
         if first > 0 and len(window) >= 4:
             mean = window.sum(axis=0) / len(window)
-            squares = np.square(window - mean)
-            scatter = np.array([squares[:, :3].sum(), squares[:, 3:].sum()]) / (len(window) - 1)
+            variances = (np.square(window - mean).sum(axis=0) / (len(window) - 1)).tolist()
+            scatter = [sum(variances[:3]), sum(variances[3:])]
             state.still_mean = mean[:3]
-            rate = float(np.linalg.norm(state.still_mean - state.main.gyro_bias))
-            state.rest = np.where(state.rest > 0.0, np.minimum(state.rest * 1.001, scatter), scatter)
-            speed2 = float(state.main.velocity @ state.main.velocity)
+            rate = math.dist(state.still_mean, state.main.gyro_bias)
+            state.rest = [min(r * 1.001, s) if r > 0.0 else s for r, s in zip(state.rest, scatter, strict=True)]
+            speed2 = float(state.main.velocity.dot(state.main.velocity))
             if speed2 > 4.0 * p.still_speed**2:
-                state.moving = state.moving + 0.02 * (scatter - state.moving)
+                state.moving = [m + 0.02 * (s - m) for m, s in zip(state.moving, scatter, strict=True)]
                 if t - state.t_accepted < 1.0:
                     state.usual_speed2 += (speed2 / 3.0 - state.usual_speed2) / (60.0 * k.GRID_HZ)
-            state.still_sure = bool((state.moving > 30.0 * state.rest).any())
-            unsure = 3.0 * math.sqrt(np.trace(state.main.P[DBG, DBG]))
-            sigma2 = float(np.trace(state.main.P[DV, DV])) + k.STILL_SPEED_SIGMA**2
-            still = bool(
-                (scatter <= 9.0 * state.rest + [1e-6, 1e-4]).all()
+            state.still_sure = any(m > 30.0 * r for m, r in zip(state.moving, state.rest, strict=True))
+            P = state.main.P.diagonal().tolist()
+            unsure = 3.0 * math.sqrt(sum(P[DBG]))
+            sigma2 = sum(P[DV]) + k.STILL_SPEED_SIGMA**2
+            still = (
+                scatter[0] <= 9.0 * state.rest[0] + 1e-6
+                and scatter[1] <= 9.0 * state.rest[1] + 1e-4
                 and t > state.still_barred
                 and rate < p.still_rate + unsure
                 and speed2 < p.still_speed**2
@@ -692,7 +706,7 @@ class ReferenceTimeline:
         def loosened(sigma: float, i: int, y: float) -> float:
             return max(sigma**2 * max(float(state.constraint_nis[i]), 1.0), float(y * y))
 
-        body = f.rotation.T @ f.velocity
+        body = f.rotation.T.dot(f.velocity)
         usual = max(state.usual_speed2, k.LEAST_SPEED**2) * 2.0 * k.SPEED_TIME * k.GRID_HZ
         variances = [(factor * k.STILL_SPEED_SIGMA) ** 2 if still else usual] * 3
         if wheels and not still:
@@ -702,11 +716,11 @@ class ReferenceTimeline:
         axes = [i for i in range(3) if still or (wheels and i == 1) or not known[i]]
         H = np.zeros((len(axes) + 6, N))
         H[: len(axes), DV], H[: len(axes), TH] = _I3[axes], skew(body)[axes]
-        y = list(-body[axes])
+        y = (-body[axes]).tolist()
         variances = [variances[i] for i in axes]
         if still:
             H[3:6, DBG] = _I3
-            y += list(state.still_mean - f.gyro_bias)
+            y += (state.still_mean - f.gyro_bias).tolist()
             variances += [(2.0 * p.gyro_noise) ** 2 * k.GRID_HZ] * 3
         if ground:
             up = f.rotation.T[:, 2]
@@ -724,7 +738,7 @@ class ReferenceTimeline:
                 now = min(y[row] ** 2 / expected, 9.0) * max(state.constraint_nis[i], 1.0)
                 state.constraint_nis[i] += 0.05 * (now - state.constraint_nis[i])
         if m:
-            f.correct(H[:m], np.array(y), np.diag(variances))
+            f.correct(H[:m], np.array(y), np.array(variances) * _I[:m, :m])
 
     def _pose(self, state: _State) -> Array:
         f = state.main

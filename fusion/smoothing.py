@@ -37,7 +37,7 @@ class Smoother:
     """E, and what has been published of it."""
 
     def __init__(self) -> None:
-        self._e = np.zeros(6)
+        self._e = [0.0] * 6
         self._t = -math.inf
         self._published = -math.inf
         self._reset_id = 0
@@ -48,18 +48,20 @@ class Smoother:
         """Before the first fix there is nothing to smooth."""
         self._t = t
 
-    def offset(self, t: float) -> Array:
-        """(6,): what is left of E at t."""
+    def _left(self, t: float) -> list[float]:
         dt = t - self._t
         if dt <= 0.0:
             return self._e
-        e = self._e.tolist()
-        decayed = 1.0 - math.exp(-dt / k.SMOOTH_TIME)
+        decay = 1.0 - math.exp(-dt / k.SMOOTH_TIME)
         left = []
-        for size, most in ((math.hypot(*e[:3]), k.SMOOTH_SPEED), (math.hypot(*e[3:]), k.SMOOTH_RATE)):
-            share = 1.0 - (min(decayed, most * dt / size) if size > 0.0 else 0.0)
-            left += [share, share, share]
-        return self._e * left
+        for x, y, z, most in ((*self._e[:3], k.SMOOTH_SPEED * dt), (*self._e[3:], k.SMOOTH_RATE * dt)):
+            share = 1.0 - min(decay, most / max(math.sqrt(x * x + y * y + z * z), most))
+            left += [share * x, share * y, share * z]
+        return left
+
+    def offset(self, t: float) -> Array:
+        """(6,): what is left of E at t."""
+        return np.array(self._left(t))
 
     def publish(self, t: float) -> Array:
         """`offset`, and from now on the pose at t is kept from moving."""
@@ -69,7 +71,7 @@ class Smoother:
     def glide(self, t: float) -> None:
         """Let E decay until t, when nothing moves the pose but the IMU."""
         if t > self._t:
-            self._e = self.offset(t)
+            self._e = self._left(t)
             self._t = t
 
     def absorb(self, before: Motion, after: Motion, corrected: Array | None) -> None:
@@ -82,15 +84,17 @@ class Smoother:
         if corrected is None:
             at = min(max(self._published, after.t), after.t + k.SMOOTH_REACH)
         self.glide(at)
+        e = np.array(self._e)
         if corrected is not None:
-            self._e = self._e - corrected
+            e = e - corrected
         else:
             (old, old_rotation), (new, new_rotation) = before.at(at), after.at(at)
-            turn = log_so3(exp_so3(self._e[3:]) @ old_rotation @ new_rotation.T)
-            self._e = np.concatenate([self._e[:3] + old - new, turn])
-        far = float(np.linalg.norm(self._e[:3])) > k.SMOOTH_DISTANCE
-        turned = float(np.linalg.norm(self._e[3:])) > k.SMOOTH_ANGLE
+            turn = log_so3(exp_so3(e[3:]) @ old_rotation @ new_rotation.T)
+            e = np.concatenate([e[:3] + old - new, turn])
+        far = math.hypot(*e[:3]) > k.SMOOTH_DISTANCE
+        turned = math.hypot(*e[3:]) > k.SMOOTH_ANGLE
         if far or turned or after.reset_id != self._reset_id:
             self.resets += 1
             self._reset_id = after.reset_id
-            self.step, self._e = -self._e, np.zeros(6)
+            self.step, e = -e, np.zeros(6)
+        self._e = e.tolist()
