@@ -109,10 +109,9 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         F[DP, DV] = A_dt
         F[DP, DP] = A
         gyro_noise, accel_noise, gyro_walk, accel_walk = noise
-        force = accel_noise**2 * dt
-        carried = [0.5 * dt * force, dt * dt / 3.0 * force]
-        variances = np.array([gyro_noise**2 * dt, force, *carried, gyro_walk**2 * dt, accel_walk**2 * dt])
-        self.F, self.Q = F, variances.dot(_NOISE).reshape(N, N)
+        angle, force = gyro_noise**2 * dt, accel_noise**2 * dt
+        variances = [angle, force, 0.5 * dt * force, dt * dt / 3.0 * force, gyro_walk**2 * dt, accel_walk**2 * dt]
+        self.F, self.Q = F, np.array(variances).dot(_NOISE).reshape(N, N)
         self.predict()
 
     def correct(self, H: Array, y: Array, R: Array) -> None:
@@ -316,8 +315,8 @@ class ReferenceTimeline:
 
     def _moving(self) -> Moving:
         s = self._state
-        rate = np.zeros(3) if s.bridging else s.u[:3] - s.main.gyro_bias
-        return Moving(s.t, s.main.position, s.main.rotation, s.main.velocity, rate, s.reset_id)
+        f = s.main
+        return Moving(s.t, f.position, f.rotation, f.velocity, f.bias if s.bridging else s.u, f.bias, s.reset_id)
 
     def _absorb(self, before: tuple[bool, int, int, Array, Moving]) -> None:
         started, rewinds, cursor, corrected, moving = before
@@ -391,7 +390,9 @@ class ReferenceTimeline:
 
     def _insert_sample(self, sample: tuple[float, ...]) -> bool:
         t = sample[0]
-        place = bisect.bisect_right(self._samples, (t, math.inf))
+        place = len(self._samples)
+        if place and t <= self._samples[-1][0]:
+            place = bisect.bisect_right(self._samples, (t, math.inf))
         replaces = False
         if place and self._samples[place - 1][0] == t:
             self._figures["imu_duplicates"] += 1
@@ -669,7 +670,8 @@ class ReferenceTimeline:
         still = False
         if first > 0 and len(window) >= 4:
             mean = window.sum(axis=0) / len(window)
-            variances = (np.square(window - mean).sum(axis=0) / (len(window) - 1)).tolist()
+            off = window - mean
+            variances = (np.einsum("ij,ij->j", off, off) / (len(window) - 1)).tolist()
             scatter = [sum(variances[:3]), sum(variances[3:])]
             state.still_mean = mean[:3]
             rate = math.dist(state.still_mean, state.main.gyro_bias)

@@ -18,19 +18,21 @@ from fusion.measurements import Array
 
 
 class Motion(NamedTuple):
-    """Where a filter is and how it moves: t, position, rotation (3, 3), velocity (world), rate (body), its reset_id."""
+    """Where a filter is and how it moves: t, position, rotation (3, 3), velocity (world), IMU sample u (6,) and its
+    bias, its reset_id."""
 
     t: float
     position: Array
     rotation: Array
     velocity: Array
-    rate: Array
+    u: Array
+    bias: Array
     reset_id: int
 
     def at(self, t: float) -> tuple[Array, Array]:
         """Position and rotation at t, straight on."""
         dt = t - self.t
-        return self.position + self.velocity * dt, self.rotation @ exp_so3(self.rate * dt)
+        return self.position + self.velocity * dt, self.rotation @ exp_so3((self.u - self.bias)[:3] * dt)
 
 
 class Smoother:
