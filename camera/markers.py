@@ -59,7 +59,7 @@ def dictionary_by_name(name: str) -> cv2.aruco.Dictionary:
     plain = name.strip().upper().removeprefix("DICT_")
     if plain not in DICTIONARIES:
         near = difflib.get_close_matches(plain, DICTIONARIES, 1, 0.5)
-        suggestion = f"; did you mean {near[0]}?" if near else ""
+        suggestion = f"; did you mean {near[0]}?" if near else "."
         raise DictionaryError(f"no marker dictionary {name!r}{suggestion} There are: {', '.join(DICTIONARIES)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{plain}"))
 
@@ -190,6 +190,8 @@ class MarkerDetector:
         by_way: dict[_Pass, set[int]] = {}
         for way in _PASSES:
             if way.scale > 1.0 and picture.size > _ENLARGE_UP_TO:
+                continue
+            if min(picture.shape) * way.scale < 1.0:
                 continue
             new = self._look(picture, way)
             by_way[way] = {marker.id for marker in new}

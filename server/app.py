@@ -115,8 +115,7 @@ class _Visitor:
 
     @classmethod
     def of(cls, connection: ServerConnection, path: str) -> _Visitor:
-        address = connection.remote_address
-        return cls(connection, f"{path} from {address[0]}:{address[1]}" if isinstance(address, tuple) else path)
+        return cls(connection, f"{path} from {_address(connection)}")
 
 
 @dataclass(eq=False)
@@ -396,7 +395,10 @@ class Service:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answers what is no WebSocket; None lets a WebSocket in."""
-        path = urlsplit(request.path).path
+        try:
+            path = urlsplit(request.path).path
+        except ValueError:
+            return _text(400, f"This is no path: {request.path}\n{_THERE_IS}", request)
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return None if path in _WEBSOCKETS else _text(404, f"No WebSocket at {path}\n{_THERE_IS}", request)
         if request.method not in ("GET", "HEAD"):
@@ -424,7 +426,7 @@ class Service:
                 await self._serve_tracker(visitor)
         except RefusedError as error:
             self.refused += 1
-            log.warning("%s was refused: %s", visitor.name, error)
+            log.warning("%s was refused: %s", visitor.name, _for_log(error))
             with contextlib.suppress(ConnectionClosed):
                 await connection.send(encode(Error(str(error))), text=True)
                 # A close frame holds 123 bytes of reason.
@@ -442,7 +444,7 @@ class Service:
         self.refused += 1
         visitor.refused += 1
         if visitor.refused == 1:
-            log.warning("%s sent a message that cannot be used: %s", visitor.name, error)
+            log.warning("%s sent a message that cannot be used: %s", visitor.name, _for_log(error))
         await visitor.connection.send(encode(Error(str(error))), text=True)
 
     async def _serve_tracker(self, visitor: _Visitor) -> None:
@@ -553,7 +555,7 @@ class Service:
         before = self._links.get(name)
         if before is not None:
             if now - before.heard < SILENCE:
-                raise RefusedError(f'robot "{name}" is already connected, from {before.connection.remote_address}')
+                raise RefusedError(f'robot "{name}" is already connected, from {_address(before.connection)}')
             log.info("robot %s has connected anew; its old connection was silent", name)
             before.connection.transport.abort()
         link = self._links[name] = _Link(connection, now)
@@ -585,6 +587,18 @@ class Service:
                 now = link.questions[id] = time.monotonic()
                 broadcast([link.connection], encode(ClockQuestion(id, now)), text=True)
             await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
+
+
+def _for_log(error: Exception) -> str:
+    """In one line of bearable length: what a client sent is quoted in it."""
+    text = str(error)
+    text = text if len(text) <= 300 else text[:297] + "..."
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _address(connection: ServerConnection) -> str:
+    address = connection.remote_address
+    return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)
 
 
 def _text(status: int, text: str, request: Request) -> Response:

@@ -161,10 +161,12 @@ class Camera:
                     self.status = "the source has ended"
                     log.info("camera %s: %s", self.config.name, self.status)
                     return True
+                seen = self._see(frame)
+                # Not before: a frame of the wrong size is no success.
                 if self.status:
                     log.info("camera %s: frames are coming", self.config.name)
                     self.status = ""
-                self._deliver(self._see(frame))
+                self._deliver(seen)
         finally:
             self._source = None
             source.close()

@@ -135,7 +135,7 @@ def load(path: str | Path) -> Config:
     """Read, decode and check a configuration file. Raises OSError, and ConfigError for what it says."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason} at byte {error.start})") from None
     return parse(text, name=str(path), folder=path.parent)
@@ -147,6 +147,8 @@ def parse(text: str, name: str = "configuration", folder: Path = Path()) -> Conf
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{name}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{name}: nested too deeply for a configuration") from None
     source = _Source(name, text, raw)
     for path, value in _leaves(raw):
         if isinstance(value, float) and not math.isfinite(value):

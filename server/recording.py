@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -60,7 +60,8 @@ class Recording(NamedTuple):
 def robot_folders(folder: Path) -> list[Path]:
     """The folder itself if it holds an imu.csv, else its subfolders that do. Raises RecordingError if there is none."""
     if not folder.is_dir():
-        raise RecordingError(f"{folder}: no such folder; a recording is a folder with imu.csv and fixes.csv")
+        what = "is no folder" if folder.exists() else "no such folder"
+        raise RecordingError(f"{folder}: {what}; a recording is a folder with imu.csv and fixes.csv")
     if (folder / "imu.csv").is_file():
         return [folder]
     found = sorted(path.parent for path in folder.glob("*/imu.csv"))
@@ -127,13 +128,23 @@ def _numbers(path: Path, names: list[str], wanted: Sequence[str]) -> Array:
             return table.reshape(-1, len(wanted))
     except (ValueError, IndexError):
         pass  # said with its line below
-    with _open(path) as file:
-        for line, row in enumerate(csv.reader(file), start=1):
-            if line == 1 or not row:
-                continue
-            for name, column in zip(wanted, columns, strict=True):
-                _number(path, line, name, row[column] if column < len(row) else None)
+    for line, row in _rows(path):
+        for name, column in zip(wanted, columns, strict=True):
+            _number(path, line, name, row[column] if column < len(row) else None)
     raise RecordingError(f"{path}: cannot be read as numbers")
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of each line after the header that is not empty."""
+    with _open(path) as file:
+        try:
+            for line, row in enumerate(csv.reader(file), start=1):
+                if line > 1 and row:
+                    yield line, row
+        except UnicodeDecodeError:
+            raise RecordingError(f"{path}: this is no text file") from None
+        except csv.Error as error:
+            raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:
@@ -144,7 +155,9 @@ def _number(path: Path, line: int, name: str, text: str | None) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise RecordingError(f"{path}, line {line}: {name} is {text.strip() or 'empty'!r}, a finite number is needed")
+        found = text.strip() or "empty"
+        found = found if len(found) <= 60 else found[:57] + "..."
+        raise RecordingError(f"{path}, line {line}: {name} is {found!r}, a finite number is needed")
     return value
 
 
@@ -161,25 +174,22 @@ def _must_rise(path: Path, name: str, t: Array) -> None:
 def _load_fixes(path: Path, params: FilterParams) -> list[PoseFix]:
     names = _header(path, ("t_s", "arrival_s", *POSE_COLUMNS))
     fixes = []
-    with _open(path) as file:
-        for line, row in enumerate(csv.reader(file), start=1):
-            if line == 1 or not row:
-                continue
-            # a column that is not there, or empty, is absent
-            cells = {name: text for name, text in zip(names, row, strict=False) if text.strip()}
+    for line, row in _rows(path):
+        # a column that is not there, or empty, is absent
+        cells = {name: text for name, text in zip(names, row, strict=False) if text.strip()}
 
-            def number(name: str, line: int = line, cells: dict[str, str] = cells) -> float:
-                return _number(path, line, name, cells.get(name))
+        def number(name: str, line: int = line, cells: dict[str, str] = cells) -> float:
+            return _number(path, line, name, cells.get(name))
 
-            try:
-                hypotheses = [_hypothesis(cells, number, "", params)]
-                if "alt_x" in cells:
-                    hypotheses.append(_hypothesis(cells, number, "alt_", params))
-                source = cells.get("source", "").strip()
-                fix = PoseFix("", number("t_s"), number("arrival_s"), tuple(hypotheses), source)
-            except MeasurementError as error:
-                raise RecordingError(f"{path}, line {line}: {error}") from None
-            fixes.append(fix)
+        try:
+            hypotheses = [_hypothesis(cells, number, "", params)]
+            if "alt_x" in cells:
+                hypotheses.append(_hypothesis(cells, number, "alt_", params))
+            source = cells.get("source", "").strip()
+            fix = PoseFix("", number("t_s"), number("arrival_s"), tuple(hypotheses), source)
+        except MeasurementError as error:
+            raise RecordingError(f"{path}, line {line}: {error}") from None
+        fixes.append(fix)
     return sorted(fixes, key=lambda fix: fix.arrival)
 
 

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import logging
+import os
 import signal
 import sys
 from pathlib import Path
@@ -22,12 +23,25 @@ from server.recording import Recorder
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", nargs="?", metavar="CONFIG.toml", help="without it: a simulated room to look at")
     parser.add_argument("--host", help="address to listen on, instead of the configured one")
-    parser.add_argument("--port", type=int, help="port to listen on, instead of the configured one; 0 for any free one")
+    parser.add_argument(
+        "--port",
+        type=_port,
+        metavar="PORT",
+        help="port to listen on, instead of the configured one; 0 for any free one",
+    )
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="keep all inputs there, for `steadfix replay`")
 
 
+def _port(text: str) -> int:
+    if not (text.isdecimal() and text.isascii() and int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"{text!r} is no port, 0 to 65535 are")
+    return int(text)
+
+
 def run(args: argparse.Namespace) -> int:
-    logging.basicConfig(format="%(asctime)s  %(message)s", datefmt="%H:%M:%S", level=logging.INFO, stream=sys.stderr)
+    # A descriptor of its own: `camera.capture` silences the process's standard error now and then, for C libraries.
+    stream = os.fdopen(os.dup(sys.stderr.fileno()), "w", buffering=1, errors="backslashreplace")
+    logging.basicConfig(format="%(asctime)s  %(message)s", datefmt="%H:%M:%S", level=logging.INFO, stream=stream)
     # Its INFO is one line for each connection.
     logging.getLogger("websockets").setLevel(logging.ERROR)
     # One thread for each camera is what keeps several of them fast.

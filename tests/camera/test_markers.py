@@ -104,6 +104,7 @@ def test_nothing_is_found_on_an_empty_floor_or_in_noise():
         random.integers(0, 256, (240, 320)).astype(np.uint8),
         np.zeros((64, 64), np.uint8),
         np.full((3, 5), 255, np.uint8),
+        np.full((1, 1), 255, np.uint8),
     ):
         assert detector.search(image) == []
 

@@ -57,6 +57,8 @@ def test_plain_requests() -> None:
                 assert status == 404
                 assert "/healthz" in text
                 assert "/v1/poses" in text
+            # urlsplit takes what is before the next slash for a host.
+            assert (await get(service, "//[/"))[0] == 400
             assert (await get(service, "/v1/poses"))[0] == 426
             assert (await get(service, "/", "DELETE"))[0] == 405
 
@@ -543,15 +545,30 @@ def test_a_camera_that_is_lost_is_opened_again(camera_config: Config, monkeypatc
     assert len(opened) >= 3
 
 
-def test_a_frame_of_another_size_than_the_calibration(tmp_path: Path) -> None:
+def test_a_frame_of_another_size_than_the_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("server.cameras.FIRST_PAUSE", 0.01)
+    caplog.set_level("INFO")
+    opened: list[Ceiling] = []
+
+    def open_camera(config: CameraConfig) -> Ceiling:
+        opened.append(Ceiling(config))
+        return opened[-1]
+
     other = Intrinsics(INTRINSICS.camera_matrix, INTRINSICS.distortion, 1280, 960)
     save_intrinsics(tmp_path / "camera.toml", other)
 
     async def main() -> None:
-        async with serving(parse(CONFIG + CAMERA, folder=tmp_path), open_camera=Ceiling) as service:
-            await until(lambda: "640 x 480" in service.cameras["ceiling"].status)
+        async with serving(parse(CONFIG + CAMERA, folder=tmp_path), open_camera=open_camera) as service:
+            camera = service.cameras["ceiling"]
+            await until(lambda: "640 x 480" in camera.status)
+            # Nor does it come and go in the health and in the log with each frame.
+            await until(lambda: len(opened) > 2)
 
     run(main)
+    assert "frames are coming" not in caplog.text
+    assert caplog.text.count("640 x 480") == 1
 
 
 def test_a_camera_without_calibration(tmp_path: Path) -> None:

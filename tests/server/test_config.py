@@ -132,3 +132,14 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match=r"room\.toml: not a text file in UTF-8"):
         load(path)
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "room.toml"
+    path.write_text("[server]\nport = 4242\n", encoding="utf-8-sig")
+    assert load(path).server.port == 4242
+
+
+def test_nested_too_deeply() -> None:
+    with pytest.raises(ConfigError, match="nested too deeply"):
+        parse("a = " + "[" * 5000 + "]" * 5000)

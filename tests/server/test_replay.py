@@ -263,6 +263,8 @@ ROW = ",".join(map(str, circle.imu(np.array([0.0]))[0].tolist()))
             {"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz\n1,1.1,0,0,0,2,0,0,0\n"},
             "fixes.csv, line 2: quaternion of norm 2",
         ),
+        ({"fixes.csv": b"t_s,arrival_s,x,y,z,qw,qx,qy,qz\n\xff\xfe\n"}, "fixes.csv: this is no text file"),
+        ({"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz\n" + "1" * 200_000}, "fixes.csv: cannot be read as CSV"),
         ({"truth.csv": "t_s,x,y\n0,0,0\n"}, "truth.csv, line 1: no column z"),
     ],
 )
@@ -284,6 +286,9 @@ def test_a_recording_that_cannot_be_replayed_says_why_and_where(tmp_path, capsys
 def test_no_folder(tmp_path):
     with pytest.raises(RecordingError, match="no such folder"):
         robot_folders(tmp_path / "nowhere")
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match="is no folder"):
+        robot_folders(tmp_path / "file")
     with pytest.raises(RecordingError, match=r"neither it nor a folder in it holds an imu\.csv"):
         robot_folders(tmp_path)
 
