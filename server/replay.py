@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any, get_args
@@ -195,6 +196,23 @@ def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion
     return params, args.motion or motion, args.engine or engine
 
 
+def _compile() -> None:
+    """`warm_up` on a thread of its own: here a Ctrl-C could fall into a callback of the compiler, which swallows it."""
+    errors: list[Exception] = []
+
+    def work() -> None:
+        try:
+            warm_up()
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work, name="warm-up", daemon=True)
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]
+
+
 def run(args: argparse.Namespace) -> int:
     """Replay, print, write. -> exit status."""
     folders = robot_folders(args.recording)
@@ -204,7 +222,7 @@ def run(args: argparse.Namespace) -> int:
         params, motion, engine = _settings(args, folder.resolve().name)
         recording = load(folder, params)
         if engine == "numba":
-            warm_up()
+            _compile()
         health = Health(Localiser(recording.name, params, motion, engine))
         with tqdm(
             total=len(recording.samples), unit=" samples", delay=1.0, leave=False, disable=not sys.stderr.isatty()

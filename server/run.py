@@ -54,7 +54,7 @@ async def _run(args: argparse.Namespace) -> int:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         # Not the loop's own way, which loses a signal while the loop is too busy to read what threads tell it.
-        signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
+        signal.signal(number, lambda *_: _set(loop, stop))
     if args.config is not None:
         await _serve_until(stop, load(args.config), args)
         return 0
@@ -65,6 +65,12 @@ async def _run(args: argparse.Namespace) -> int:
         room.stop()
     print(room.report(), flush=True)
     return 0
+
+
+def _set(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
+    # A second Ctrl-C may come when the loop is closed already.
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(stop.set)
 
 
 async def _serve_until(

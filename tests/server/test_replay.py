@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -208,6 +212,14 @@ def test_the_smooth_channel_is_written_too(recorded, tmp_path, capsys):
     # 0.5 m/s and at most 0.3 m/s of gliding for 10 ms
     assert steps["smooth"] < 0.008 + 0.001
     assert steps["best"] > 2.0 * steps["smooth"]
+
+
+def test_ctrl_c_while_the_filter_is_compiled(tmp_path, monkeypatch):
+    monkeypatch.setattr("server.replay.warm_up", lambda: time.sleep(30.0))
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began = time.monotonic()
+    assert main(["replay", str(plain(tmp_path / "drive"))]) == 130
+    assert time.monotonic() - began < 10.0
 
 
 def test_a_folder_of_robots(recorded, tmp_path, capsys):
