@@ -216,11 +216,20 @@ def _compile() -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay, print, write. -> exit status."""
     folders = robot_folders(args.recording)
+    failed = False
     if args.out is not None and len(folders) > 1:
         args.out.mkdir(parents=True, exist_ok=True)
     for folder in folders:
         params, motion, engine = _settings(args, folder.resolve().name)
-        recording = load(folder, params)
+        try:
+            recording = load(folder, params)
+        except RecordingError as error:
+            if len(folders) == 1:
+                raise
+            # A robot that never spoke, say, must not keep the others from being replayed.
+            print(f"steadfix: {error}", file=sys.stderr)
+            failed = True
+            continue
         if engine == "numba":
             _compile()
         health = Health(Localiser(recording.name, params, motion, engine))
@@ -235,4 +244,4 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(figures) if args.json else _table(figures))
         if args.out is not None:
             write_tum(args.out / f"{recording.name}.tum" if len(folders) > 1 else args.out, track)
-    return 0
+    return 2 if failed else 0

@@ -224,6 +224,10 @@ def test_ctrl_c_while_the_filter_is_compiled(tmp_path, monkeypatch):
 
 def test_a_folder_of_robots(recorded, tmp_path, capsys):
     folder, _ = recorded
+    assert main(["replay", str(folder.parent), "--json"]) == 2
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["recording"] == "rover"
+    assert "no sample after the header" in captured.err
     for file in (folder.parent / "idle").iterdir():
         file.unlink()
     assert robot_folders(folder.parent) == [folder]
