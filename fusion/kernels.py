@@ -579,21 +579,31 @@ def _start(s, o, prm, fix, k, afresh):
 
 @_jit
 def _initialise(s, prm, fix):
-    """Start from the first fix; gravity then corrects a tilt that a flat marker knows badly."""
+    """Start from the first fix; gravity decides between its poses, and corrects a tilt that is known badly."""
+    score = np.zeros(2)
+    B = np.empty((3, 3))
+    for h in range(int(fix[F_COUNT])):
+        k = F_HYPOTHESES + h * HYPOTHESIS
+        score[h] = fix[k + H_MISFIT]
+        if s[ACCEL_COUNT] > 0.0:
+            _matrix(fix, k + H_QUAT, B)
+            for i in range(3):
+                score[h] += ((s[ACCEL_MEAN + i] - GRAVITY * B[2, i]) / GRAVITY_SIGMA) ** 2
+    chosen = F_HYPOTHESES
     if fix[F_COUNT] > 1.0:
-        other = fix[F_HYPOTHESES + HYPOTHESIS + H_MISFIT] - fix[F_HYPOTHESES + H_MISFIT]
-        if other < prm[HYPOTHESIS_MARGIN]:
+        if score[1] < score[0]:
+            chosen += HYPOTHESIS
+        if abs(score[1] - score[0]) < prm[HYPOTHESIS_MARGIN]:
             fix = fix.copy()
             for i in range(3, 5):
-                fix[F_HYPOTHESES + H_COV + 7 * i] += UNKNOWN_TILT_SIGMA * UNKNOWN_TILT_SIGMA
-    _start(s, MAIN, prm, fix, F_HYPOTHESES, True)
+                fix[chosen + H_COV + 7 * i] += UNKNOWN_TILT_SIGMA * UNKNOWN_TILT_SIGMA
+    _start(s, MAIN, prm, fix, chosen, True)
     s[INITIALISED] = 1.0
     s[ACCEPTED_COUNT] = 1.0
     s[T_ACCEPTED] = s[T]
     if s[ACCEL_COUNT] == 0.0:
         return
     # mean specific force = g R̂ᵀu + b_a, u up: H = [g u_b]x on attitude, 1 on bias, g R̂ᵀ[e_x e_y] on tilt
-    B = np.empty((3, 3))
     _matrix(s, MAIN, B)
     H, y, R, S = np.zeros((3, N)), np.empty(3), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):

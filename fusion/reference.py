@@ -502,12 +502,16 @@ class ReferenceTimeline:
     def _initialise(self, state: _State, fix: Array) -> None:
         p = self._params
         state.main = f = ErrorStateFilter()
-        hypothesis = self._hypothesis(fix, 0).copy()
-        if fix[k.F_COUNT] > 1:
-            lead = self._hypothesis(fix, 1)[k.H_MISFIT] - hypothesis[k.H_MISFIT]
-            if lead < p.hypothesis_margin:
-                for i in (3, 4):
-                    hypothesis[k.H_COV + 7 * i] += k.UNKNOWN_TILT_SIGMA**2
+        scores = []
+        for i in range(int(fix[k.F_COUNT])):
+            pose = self._hypothesis(fix, i)
+            up = rotation_from_quaternion(pose[k.H_QUAT : k.H_QUAT + 4])[2]
+            denied = (state.accel_mean - GRAVITY * up) / k.GRAVITY_SIGMA if state.accel_count else np.zeros(3)
+            scores.append(float(pose[k.H_MISFIT] + denied @ denied))
+        hypothesis = self._hypothesis(fix, int(np.argmin(scores))).copy()
+        if len(scores) > 1 and abs(scores[1] - scores[0]) < p.hypothesis_margin:
+            for i in (3, 4):
+                hypothesis[k.H_COV + 7 * i] += k.UNKNOWN_TILT_SIGMA**2
         f.P = self._prior()
         f.start(hypothesis, p.velocity_sigma)
         state.initialised = True

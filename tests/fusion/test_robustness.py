@@ -113,7 +113,6 @@ def test_flips_do_no_harm_when_both_poses_are_given():
     assert flipped < 1.1 * plain
 
 
-@pytest.mark.xfail(strict=True, reason="gravity denies the likelier pose of the first fix, but the other is not tried")
 def test_a_flipped_first_fix_is_seen_by_gravity():
     """The less likely pose has 13 more in misfit, and is upright; the other leans by 57 degrees."""
     simulation = simulate(random_ground(3), 3, 60.0, camera=CameraParams(two_poses=True, flip=0.4))
