@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import NoReturn
 
 # All matrices here are small: BLAS threads for them only fight over the cores (25 ms a frame on two busy ones). numpy
 # reads it when it is imported, hence this place; a user's own setting stays.
@@ -73,5 +75,15 @@ def _words(error: OSError) -> str:
     return f"{error.filename}: {(error.strerror or str(error)).lower()}"
 
 
+def entry() -> NoReturn:
+    """The command as a process of its own."""
+    status = main()
+    with contextlib.suppress(OSError):
+        sys.stderr.flush()
+    # Not by way of the interpreter's end, which tears daemon threads out of OpenCV's C++: "FATAL: exception not
+    # rethrown", seen on a loaded machine. Whatever must be closed has been closed by now.
+    os._exit(status)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    entry()
