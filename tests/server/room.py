@@ -13,10 +13,10 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 import numpy as np
-from camera.capture import Frame
 from websockets.asyncio.client import ClientConnection, connect
 
 from camera.calibration import Intrinsics
+from camera.capture import Frame
 from camera.synthetic import Room, straight_down
 from fusion.geometry import rotation_about_z, transform
 from fusion.measurements import PoseFix, PoseHypothesis
