@@ -19,7 +19,7 @@ The state is a function of the *set* of stamped inputs, not of their order of ar
 rings sorted by stamp; checkpoints of the whole state lie beside them. A late input goes to its place, the newest
 checkpoint before it is loaded, and everything after is done again. All that adapts is therefore part of the state.
 
-One flat float64 array, `memory`, holds all of one robot, since each array argument costs about 0.1 us of dispatch.
+One flat float64 array, `memory`, holds all of one robot, since each array argument slows the call from Python.
 """
 
 # numba reads these functions: plain loops and scalars are what it compiles best.
@@ -175,7 +175,7 @@ GRAVITY_SIGMA = 0.5  # m/s2: how far the mean specific force before the start ma
 UNKNOWN_TILT_SIGMA = math.radians(30.0)  # of a flat marker whose two poses are too close to call
 
 _jit: Any = njit(cache=True, error_model="numpy", nogil=True)
-# For what is called at one place for every sample: a call costs 20 ns or more, since each array is seven arguments.
+# For what is called at one place for every sample: a call is dear, since each array is seven arguments.
 _inline: Any = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 
 
@@ -230,7 +230,7 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_wa
     which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
     A drops out of Q.
 
-    The filter is an array of its own here: with an offset in the index the loops over P are not vectorised (0.37 us).
+    The filter is an array of its own here: with an offset in the index the loops over P are not vectorised.
     """
     wx, wy, wz = gx - f[BG], gy - f[BG + 1], gz - f[BG + 2]
     fx, fy, fz = ax - f[BA], ay - f[BA + 1], az - f[BA + 2]

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,23 +24,12 @@ class MeasurementError(ValueError):
     """A measurement that cannot be one: a wrong shape, NaN, a covariance that is none. The text says which."""
 
 
-class ImuSample(NamedTuple):
-    """One reading: `t` in s, angular rate in rad/s, specific force in m/s2 (+9.81 on z at rest), body axes."""
-
-    t: float
-    gx: float
-    gy: float
-    gz: float
-    ax: float
-    ay: float
-    az: float
-
-
 @dataclass(frozen=True, slots=True)
 class ImuBatch:
     """Consecutive IMU readings of one robot.
 
-    `samples`: (n, 7) float64, columns as in `ImuSample`; stamps need not be sorted.
+    `samples`: (n, 7) float64: stamp in s, angular rate in rad/s, specific force in m/s2 (+9.81 on z at rest), in
+    body axes; stamps need not be sorted.
     Raises MeasurementError on a wrong shape or a number that is not finite.
     """
 

@@ -41,8 +41,8 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     accel_bias_sigma: NotNegative = 0.2
     """m/s2: prior of the accelerometer bias at the first fix."""
     velocity_sigma: Positive = 2.0
-    """m/s: prior of the velocity at the first fix. Wide: with 0.5 a start at 3 m/s is refused fix after fix, and the
-    second fix makes the prior matter no more."""
+    """m/s: prior of the velocity at the first fix. Wide, since a robot may be found at full speed, and with
+    the second fix the prior matters no more."""
     time_offset_sigma: NotNegative = 0.05
     """s: prior of the camera's time offset, to be added to a fix's stamp; 0 holds it at 0."""
     tilt_sigma: NotNegative = 0.035
@@ -76,7 +76,7 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     """m/s: vertical speed of a robot on the floor, ten times a second."""
     ground_tilt_sigma: Positive = 0.4
     """rad: its roll and pitch, likewise. Wide, since it is the same error each time: with 0.05 a device that is held
-    askew is forced upright (handheld_mocap as "ground": 1.06 deg RMSE, 0.29 deg with this)."""
+    askew is forced upright (handheld_mocap replayed as "ground": 1.07 deg RMSE, 0.30 deg with this)."""
     wheel_velocity_sigma: Positive = 0.03
     """m/s: sideways speed of a robot on wheels, ten times a second."""
     usual_speed: Positive = 0.7

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import NoReturn
 
-# All matrices here are small: BLAS threads for them only fight over the cores (25 ms a frame on two busy ones). numpy
-# reads it when it is imported, hence this place; a user's own setting stays.
+# All matrices here are small: BLAS threads for them only fight over the cores. numpy reads it when it is imported,
+# hence this place; a user's own setting stays.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Imported only when asked for: `steadfix detect` must not wait for the filter's compiler.
