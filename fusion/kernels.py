@@ -165,6 +165,9 @@ SMOOTH_SPEED, SMOOTH_RATE = 0.3, math.radians(60.0)  # m/s, rad/s: but not faste
 SMOOTH_DISTANCE, SMOOTH_ANGLE = 0.25, math.radians(20.0)  # m, rad: and beyond this the channel steps, and says so
 SMOOTH_REACH = 0.5  # s: so far ahead of the newest input a published pose is kept from moving
 OUTLIER_DISTANCE = 0.15  # m: a fix that is rejected by less tells of noise, not of a mistake
+MOST_TAUGHT = 6.0  # d2 / dof - 1 of one fix, at most, that the noise learns from
+LEAST_EXCESS, MOST_EXCESS = -1.0, 8.0  # bounds of EXCESS: e^8 is 55 times the sigma
+IGNORED_EXCESS = 0.7  # less is chance: matched noise wanders about so far
 ADAPTATION_HZ = 2.0  # fixes more often than this share their say in the noise
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
@@ -211,6 +214,12 @@ def _rotation_vector(s, o, r, k, y, at):
     y[at] = factor * a
     y[at + 1] = factor * b
     y[at + 2] = factor * c
+
+
+@_jit
+def _length(a, at):
+    """Of the vector a[at:at+3]."""
+    return math.sqrt(a[at] * a[at] + a[at + 1] * a[at + 1] + a[at + 2] * a[at + 2])
 
 
 # ---------------------------------------------------------------------------------------------------------- filter
@@ -653,8 +662,8 @@ def _adapt(s, prm, figures, most):
         for k in range(2):
             i = EXCESS + block + 2 * k
             part = to_process if k == 0 else 1.0 - to_process
-            s[i] = min(max(s[i] + gain * part * more, -1.0), 8.0)
-            factor = math.exp(max(s[i] - 0.7, 0.0))
+            s[i] = min(max(s[i] + gain * part * more, LEAST_EXCESS), MOST_EXCESS)
+            factor = math.exp(max(s[i] - IGNORED_EXCESS, 0.0))
             s[SCALE + block + 2 * k] = math.sqrt(factor) if k == 0 else factor
 
 
@@ -665,7 +674,8 @@ def _judge(s, prm, fix):
     The way back: a rejected fix starts a shadow filter, which runs on the same IMU and takes the rejects that follow.
     When enough in a row agree with it, and its attitude with the gyro's, it takes over. A marker entered wrongly in
     the map gives long runs that agree with each other but not with the gyro; those must last longer than any such run.
-    After that long without an accepted fix the filter starts anew from any: it is never locked out for good.
+    Twice as many in a row that do not even agree with each other, but are not turned either, and any at all after that
+    long without an accepted one, set the filter anew from the last: it is never locked out for good.
     """
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     fix[F_OUTCOME] = REJECTED
@@ -695,7 +705,7 @@ def _judge(s, prm, fix):
         if ratio > prm[GATE_INFLATION]:
             continue
         if o == MAIN:
-            _adapt(s, prm, figures, 6.0)
+            _adapt(s, prm, figures, MOST_TAUGHT)
         if ratio > 1.0:
             # as if the fix were less certain, until it just passes
             R += (ratio - 1.0) * S
@@ -710,25 +720,11 @@ def _judge(s, prm, fix):
     fix[F_D2:F_REPORTED] = figures
     # A reject that is not far off, that agrees with the one before, or is one of many, is no outlier: something is
     # noisier than it says. Unless it is turned, as flips are.
-    far = (
-        math.sqrt(
-            figures[F_INNOVATION - F_D2] ** 2
-            + figures[F_INNOVATION - F_D2 + 1] ** 2
-            + figures[F_INNOVATION - F_D2 + 2] ** 2
-        )
-        > OUTLIER_DISTANCE
-    )
-    turned = (
-        math.sqrt(
-            figures[F_INNOVATION - F_D2 + 3] ** 2
-            + figures[F_INNOVATION - F_D2 + 4] ** 2
-            + figures[F_INNOVATION - F_D2 + 5] ** 2
-        )
-        > prm[REINIT_ANGLE]
-    )
+    far = _length(figures, F_INNOVATION - F_D2) > OUTLIER_DISTANCE
+    turned = _length(figures, F_INNOVATION - F_D2 + 3) > prm[REINIT_ANGLE]
     s[REJECTED_RUN] += 1.0
     if agrees or not (far or turned) or s[REJECTED_RUN] >= prm[REINIT_COUNT]:
-        _adapt(s, prm, figures, 0.0 if turned else 6.0)
+        _adapt(s, prm, figures, 0.0 if turned else MOST_TAUGHT)
     if not shadows:
         s[REJECTED_SINCE] = s[T]
     patient = s[T] - s[REJECTED_SINCE] >= prm[REINIT_PATIENCE]
@@ -740,7 +736,7 @@ def _judge(s, prm, fix):
         for i in range(3):
             for j in range(3):
                 S[i, j] = s[COV + N * i + j] + s[SHADOW + COV + N * i + j]
-        angle = math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+        angle = _length(y, 0)
         as_gyro = _distance(S, y, 0, 3)[0] <= prm[GATE_BLOCK] or (
             # with noise set too small nothing ever agrees; a map entry is not wrong by a little
             s[SHADOW_COUNT] >= 2.0 * prm[REINIT_COUNT] and angle <= prm[REINIT_ANGLE]

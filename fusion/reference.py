@@ -582,8 +582,8 @@ class ReferenceTimeline:
             to_process = min(max(0.5 + follows, 0.0), 1.0)
             for i, part in ((block, to_process), (block + 2, 1.0 - to_process)):
                 excess = state.excess[i] + gain * part * more
-                state.excess[i] = min(max(excess, -1.0), 8.0)
-                factor = math.exp(max(state.excess[i] - 0.7, 0.0))
+                state.excess[i] = min(max(excess, k.LEAST_EXCESS), k.MOST_EXCESS)
+                factor = math.exp(max(state.excess[i] - k.IGNORED_EXCESS, 0.0))
                 state.scale[i] = math.sqrt(factor) if i < 2 else factor
 
     def _judge(self, state: _State, fix: Array) -> None:
@@ -602,7 +602,7 @@ class ReferenceTimeline:
         if fix[k.F_D2_POSITION] > k.LEAVE_STILL:
             state.still_since, state.still_barred = math.inf, state.t + k.STILL_PAUSE
         if ratio <= p.gate_inflation:
-            self._adapt(state, figures, 6.0)
+            self._adapt(state, figures, k.MOST_TAUGHT)
             fix[k.F_OUTCOME] = k.ACCEPTED
             if ratio > 1.0:
                 fix[k.F_OUTCOME] = k.INFLATED
@@ -631,7 +631,7 @@ class ReferenceTimeline:
             state.shadow.correct(H, y, R)
         state.rejected_run += 1
         if agrees or not (far or turned) or state.rejected_run >= p.reinit_count:
-            self._adapt(state, figures, 0.0 if turned else 6.0)
+            self._adapt(state, figures, 0.0 if turned else k.MOST_TAUGHT)
         if state.shadow is not None and agrees:
             state.shadow_count += 1
             take = state.shadow_count >= p.reinit_count and (
