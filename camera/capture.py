@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -41,14 +42,18 @@ _stderr_lock = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture. `t`: s on the host's monotonic clock, mid-exposure as well as it is known. `image`: grey or BGR.
+    """One picture. `t`: s on the host's monotonic clock, mid-exposure of its first row as well as it is known. `image`:
+    grey or BGR.
 
-    `sequence` counts what the source delivered, frames that were skipped included.
+    `sequence` counts what the source delivered, frames that were skipped included. `exposure`: s, nan where it is not
+    known. `line_time`: s from one row's exposure to the next one's, 0 where all rows are exposed together.
     """
 
     t: float
     image: Pixels
-    sequence: int
+    sequence: int = 0
+    exposure: float = math.nan
+    line_time: float = 0.0
 
 
 class FrameSource(Protocol):
@@ -67,8 +72,8 @@ class FrameSource(Protocol):
 class Device(Protocol):
     """A camera that blocks until it has a frame."""
 
-    def grab(self) -> tuple[float, Pixels]:
-        """Mid-exposure (s, host monotonic) and picture. Raises OSError when the camera is lost."""
+    def grab(self) -> Frame:
+        """The next frame, not counted yet. Raises OSError when the camera is lost."""
 
     def close(self) -> None: ...
 
@@ -115,10 +120,10 @@ class LiveSource:
         sequence = 0
         try:
             while not self._closing:
-                t, image = self._device.grab()
+                frame = self._device.grab()
                 sequence += 1
                 with self._changed:
-                    self._frame = Frame(t, image, sequence)
+                    self._frame = replace(frame, sequence=sequence)
                     self._changed.notify_all()
         except OSError as error:
             with self._changed:
@@ -251,7 +256,7 @@ class _VideoDevice:
                 else f"camera {self._name}: cannot be opened; is it in use by another program?"
             )
 
-    def grab(self) -> tuple[float, Pixels]:
+    def grab(self) -> Frame:
         if not self._capture.grab():
             raise OSError(f"camera {self._name}: lost; it no longer delivers frames")
         now = time.monotonic()
@@ -260,7 +265,7 @@ class _VideoDevice:
         ok, image = self._capture.retrieve()
         if not ok:
             raise OSError(f"camera {self._name}: lost; it delivers frames that cannot be decoded")
-        return driver if 0.0 <= now - driver < 1.0 else now, np.asarray(image)
+        return Frame(driver if 0.0 <= now - driver < 1.0 else now, np.asarray(image))
 
     def close(self) -> None:
         self._capture.release()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from camera.capture import Frame
 from camera.markers import Image
 
 # 5 ms: at 1 m/s a marker moves 5 mm. Fixed, because automatic exposure lengthens it in the dark until all is blur.
@@ -46,7 +47,7 @@ class PiCamera:
                 f"camera picamera: cannot be started ({error}); is it connected, and in use elsewhere?"
             ) from None
 
-    def grab(self) -> tuple[float, Image]:
+    def grab(self) -> Frame:
         """Mid-exposure of the first row, and the grey values. Raises OSError when the camera is lost.
 
         The other rows follow at the sensor's line time; that of the middle row is a constant which the configuration's
@@ -64,7 +65,8 @@ class PiCamera:
             request.release()
         monotonic, boottime = time.monotonic_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         end_of_exposure = host_time(metadata["SensorTimestamp"], monotonic, boottime)
-        return end_of_exposure - 0.5e-6 * metadata["ExposureTime"], image
+        exposure = 1e-6 * metadata["ExposureTime"]
+        return Frame(end_of_exposure - 0.5 * exposure, image, exposure=exposure)
 
     def close(self) -> None:
         self._camera.stop()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from camera import capture
-from camera.capture import FileSource, LiveSource, open_source, read_image
+from camera.capture import FileSource, Frame, LiveSource, open_source, read_image
 
 WAIT = 20.0
 
@@ -122,7 +122,7 @@ class Scripted:
         frame = self.frames.pop(0)
         if isinstance(frame, OSError):
             raise frame
-        return frame, np.full((2, 2), frame, np.uint8)
+        return Frame(frame, np.full((2, 2), frame, np.uint8))
 
     def close(self):
         self.closed.set()
