@@ -240,7 +240,8 @@ def solve(
     hypotheses = _planar(view, placement) if planar else _six(view, seen, placement)
     if not hypotheses:
         return None
-    return PoseFix(robot, seen[0][1].t, arrival, tuple(hypotheses[:2]), seen[0][1].camera)
+    markers = tuple(mount.id for mount, _ in seen)
+    return PoseFix(robot, seen[0][1].t, arrival, tuple(hypotheses[:2]), seen[0][1].camera, markers)
 
 
 def solve_six(view: View, seen: Sequence[Seen]) -> list[tuple[Array, Array, float]]:

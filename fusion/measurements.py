@@ -88,7 +88,8 @@ class PoseHypothesis:
 class PoseFix:
     """An absolute pose of one robot from one frame: one hypothesis, or two (a flat marker has two poses).
 
-    The likelier hypothesis comes first. `source` names the camera.
+    The likelier hypothesis comes first. `source` names the camera, `markers` (their ids) what it saw of the robot,
+    where that is known.
     """
 
     robot: str
@@ -96,6 +97,7 @@ class PoseFix:
     arrival: float
     hypotheses: tuple[PoseHypothesis, ...]
     source: str = ""
+    markers: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.hypotheses) not in (1, 2):

@@ -2,8 +2,9 @@
 
     imu.csv     t_s,gx,gy,gz,ax,ay,az            rad/s and m/s2 in body axes; optional arrival_s
     fixes.csv   t_s,arrival_s,x,y,z,qw,qx,qy,qz  world_from_body at t_s; optional sigma_position,sigma_attitude
-                (m, rad), or what a camera knows more: misfit, source, cov_00 ... cov_55 (upper triangle of the
-                covariance as in `fusion.measurements`), and a second hypothesis with the same columns headed alt_
+                (m, rad), or what a camera knows more: misfit, source, markers (ids, with spaces between), cov_00 ...
+                cov_55 (upper triangle of the covariance as in `fusion.measurements`), and a second hypothesis with
+                the same columns headed alt_
     truth.csv   t_s,x,y,z,qw,qx,qy,qz            optional, never an input
     poses.tum   t x y z qx qy qz qw              what was published live, one line an IMU sample (TUM format)
 
@@ -35,6 +36,7 @@ FIX_COLUMNS = (
     "arrival_s",
     *HYPOTHESIS_COLUMNS,
     "source",
+    "markers",
     *(f"alt_{name}" for name in HYPOTHESIS_COLUMNS),
 )
 
@@ -161,6 +163,13 @@ def _number(path: Path, line: int, name: str, text: str | None) -> float:
     return value
 
 
+def _ids(path: Path, line: int, text: str) -> tuple[int, ...]:
+    try:
+        return tuple(map(int, text.split()))
+    except ValueError:
+        raise RecordingError(f"{path}, line {line}: markers is {text!r}, ids with spaces between are needed") from None
+
+
 def _must_rise(path: Path, name: str, t: Array) -> None:
     falls = np.flatnonzero(np.diff(t) < 0.0)
     if falls.size:
@@ -186,7 +195,8 @@ def _load_fixes(path: Path, params: FilterParams) -> list[PoseFix]:
             if "alt_x" in cells:
                 hypotheses.append(_hypothesis(cells, number, "alt_", params))
             source = cells.get("source", "").strip()
-            fix = PoseFix("", number("t_s"), number("arrival_s"), tuple(hypotheses), source)
+            markers = _ids(path, line, cells.get("markers", ""))
+            fix = PoseFix("", number("t_s"), number("arrival_s"), tuple(hypotheses), source, markers)
         except MeasurementError as error:
             raise RecordingError(f"{path}, line {line}: {error}") from None
         fixes.append(fix)
@@ -246,13 +256,14 @@ class Recorder:
     def fix(self, fix: PoseFix) -> None:
         """A fix with all that it knows."""
         cells: list[Any] = [fix.t, fix.arrival]
+        origin = fix.source.replace(",", " "), " ".join(map(str, fix.markers))
         for i, hypothesis in enumerate(fix.hypotheses):
             if i == 1:
-                cells.append(fix.source.replace(",", " "))
+                cells += origin
             cells += [*hypothesis.position, *hypothesis.quaternion_wxyz, hypothesis.misfit]
             cells += [hypothesis.covariance[at] for at in UPPER]
         if len(fix.hypotheses) == 1:
-            cells += [fix.source.replace(",", " "), *([""] * len(HYPOTHESIS_COLUMNS))]
+            cells += [*origin, *([""] * len(HYPOTHESIS_COLUMNS))]
         self._write(fix.robot, "fixes.csv", cells)
 
     def track(self, robot: str, track: Array) -> None:

@@ -100,6 +100,7 @@ def test_a_fix_without_noise_is_exact_and_carries_its_origin():
         ]
         found = solve("rover", mounts, sightings, INTRINSICS, WORLD_FROM_CAMERA, planar=True, arrival=1.25)
         assert (found.robot, found.t, found.arrival, found.source) == ("rover", 1.0, 1.25, "ceiling")
+        assert found.markers == tuple(mount.id for mount in mounts)
         np.testing.assert_allclose(found.hypotheses[0].position, truth[:3, 3], atol=1e-6)
         assert found.hypotheses[0].misfit < 1e-3
 

@@ -39,7 +39,7 @@ def inputs(seconds=6.0, seed=1):
             other = circle.hypothesis(t, rng, turned=0.3)
             covariance = other.covariance + 1e-6 * np.arange(36).reshape(6, 6) * np.eye(6)
             hypotheses.append(PoseHypothesis(other.position, other.quaternion_wxyz, covariance, 7.5))
-        arriving.append((arrival, PoseFix("rover", t, arrival, tuple(hypotheses), "ceiling")))
+        arriving.append((arrival, PoseFix("rover", t, arrival, tuple(hypotheses), "ceiling", (7, 9)[: 1 + i % 2])))
     return [measurement for _, measurement in sorted(arriving, key=lambda pair: pair[0])]
 
 
@@ -100,7 +100,7 @@ def test_what_is_recorded_is_what_was_fed(recorded):
     fed = [measurement for measurement in inputs() if isinstance(measurement, PoseFix)]
     assert [fix.t for fix in recording.fixes] == [fix.t for fix in fed]
     for a, b in zip(recording.fixes, fed, strict=True):
-        assert (a.arrival, a.source) == (b.arrival, b.source)
+        assert (a.arrival, a.source, a.markers) == (b.arrival, b.source, b.markers)
         for x, y in zip(a.hypotheses, b.hypotheses, strict=True):
             np.testing.assert_array_equal(x.position, y.position)
             np.testing.assert_array_equal(x.covariance, y.covariance)
@@ -278,6 +278,10 @@ ROW = ",".join(map(str, circle.imu(np.array([0.0]))[0].tolist()))
         (
             {"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz\n1,1.1,0,0,0,2,0,0,0\n"},
             "fixes.csv, line 2: quaternion of norm 2",
+        ),
+        (
+            {"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz,markers\n1,1.1,0,0,0,1,0,0,0,7 x\n"},
+            "fixes.csv, line 2: markers is '7 x', ids with spaces between are needed",
         ),
         ({"fixes.csv": b"t_s,arrival_s,x,y,z,qw,qx,qy,qz\n\xff\xfe\n"}, "fixes.csv: this is no text file"),
         ({"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz\n" + "1" * 200_000}, "fixes.csv: cannot be read as CSV"),
