@@ -10,6 +10,7 @@ import contextlib
 import logging
 import math
 import os
+import re
 import sys
 import threading
 import time
@@ -26,6 +27,7 @@ import cv2
 import numpy as np
 
 from camera.markers import Pixels
+from camera.stamp import host_clocks, host_time
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
@@ -34,6 +36,8 @@ IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 FOLDER_RATE_HZ = 10.0
 # A network camera that does not answer for so long is lost, s.
 NETWORK_TIMEOUT = 5.0
+# V4L2_CID_EXPOSURE_ABSOLUTE counts in these, ms.
+_EXPOSURE_UNIT_MS = 0.1
 
 _log = logging.getLogger(__name__)
 # Two threads that redirect standard error at once would leave it redirected.
@@ -79,11 +83,12 @@ class Device(Protocol):
 
 
 class LiveSource:
-    """Newest frame of a device, read by a thread of its own, which also closes it."""
+    """Newest frame of a device, read by a thread of its own, which also closes it. `line_time`: of its frames."""
 
-    def __init__(self, name: str, device: Device) -> None:
+    def __init__(self, name: str, device: Device, line_time: float = 0.0) -> None:
         self._name = name
         self._device = device
+        self._line_time = line_time
         self._changed = threading.Condition()
         self._frame: Frame | None = None
         self._read = 0
@@ -123,7 +128,7 @@ class LiveSource:
                 frame = self._device.grab()
                 sequence += 1
                 with self._changed:
-                    self._frame = replace(frame, sequence=sequence)
+                    self._frame = replace(frame, sequence=sequence, line_time=self._line_time)
                     self._changed.notify_all()
         except OSError as error:
             with self._changed:
@@ -174,23 +179,37 @@ class FileSource:
 
 
 def open_source(
-    source: str | int, *, width_px: int = 0, height_px: int = 0, frame_rate_hz: float = 0.0, paced: bool = True
+    source: str | int,
+    *,
+    width_px: int = 0,
+    height_px: int = 0,
+    frame_rate_hz: float = 0.0,
+    pixel_format: str = "",
+    exposure: float = 0.0,
+    gain: float = 0.0,
+    line_time: float = 0.0,
+    paced: bool = True,
 ) -> FrameSource:
     """Opens a camera or file.
 
     `source`: a number or "/dev/videoN" (V4L2), "rtsp://...", "picamera", a video file or a folder of images, which are
-    taken in the order of their names. Size and frame rate are a wish that a camera may not grant; 0 leaves it to the
-    camera. A file runs at its own rate, a folder at FOLDER_RATE_HZ, unless `frame_rate_hz` says otherwise;
-    `paced=False` reads them as fast as possible. Raises OSError in plain words if it is not there.
+    taken in the order of their names. Size, frame rate, `pixel_format` (four letters, V4L2 only), `exposure` (s) and
+    `gain` (a factor for the Pi's camera, the driver's own number for V4L2) are wishes; 0 and "" leave it to the camera,
+    and the log says where one is not granted. `line_time` (s) is only told to whoever reads the frames. A file runs at
+    its own rate, a folder at FOLDER_RATE_HZ, unless `frame_rate_hz` says otherwise; `paced=False` reads them as fast as
+    possible. Raises OSError in plain words if it is not there.
     """
     if source == "picamera":
         from camera.picamera import PiCamera  # libcamera only exists on a Raspberry Pi
 
-        return LiveSource("picamera", PiCamera(width_px, height_px, frame_rate_hz))
+        return LiveSource("picamera", PiCamera(width_px, height_px, frame_rate_hz, exposure, gain), line_time)
     if isinstance(source, int) or source.isdecimal():
         source = f"/dev/video{source}" if sys.platform.startswith("linux") else int(source)
-    if isinstance(source, int) or source.startswith("/dev/") or "://" in source:
-        return LiveSource(str(source), _VideoDevice(source, width_px, height_px, frame_rate_hz))
+    if isinstance(source, int) or source.startswith("/dev/"):
+        device = V4l2Device(source, width_px, height_px, frame_rate_hz, pixel_format, exposure, gain)
+        return LiveSource(str(source), device, line_time)
+    if "://" in source:
+        return LiveSource(without_password(source), NetworkCamera(source), line_time)
     path = Path(source)
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
@@ -226,55 +245,120 @@ def read_image(path: str | os.PathLike[str]) -> Pixels:
     return np.asarray(image)
 
 
-class _VideoDevice:
-    """A camera through OpenCV: V4L2 on Linux, FFmpeg for network streams."""
+class V4l2Device:
+    """A USB camera, or another with a V4L2 driver; on other systems than Linux what OpenCV finds there.
 
-    def __init__(self, source: str | int, width_px: int, height_px: int, frame_rate_hz: float) -> None:
+    `exposure` and `gain` above 0 end the camera's own automatic exposure.
+    """
+
+    def __init__(
+        self,
+        source: str | int,
+        width_px: int = 0,
+        height_px: int = 0,
+        frame_rate_hz: float = 0.0,
+        pixel_format: str = "",
+        exposure: float = 0.0,
+        gain: float = 0.0,
+    ) -> None:
         self._name = str(source)
-        if isinstance(source, str) and source.startswith("/dev/"):
+        self._clock: str | None = None
+        if isinstance(source, str):
             _check_device(Path(source))
-        wanted = {
-            cv2.CAP_PROP_FRAME_WIDTH: width_px,
-            cv2.CAP_PROP_FRAME_HEIGHT: height_px,
-            cv2.CAP_PROP_FPS: frame_rate_hz,
-        }
         with _stderr_silenced():
-            if "://" in self._name:
-                limit = int(1000.0 * NETWORK_TIMEOUT)
-                limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
-                self._capture = cv2.VideoCapture(self._name, cv2.CAP_FFMPEG, limits)
-            else:
-                self._capture = cv2.VideoCapture(source, cv2.CAP_ANY)
-                for key, value in wanted.items():
-                    if value:
-                        self._capture.set(key, value)
-                self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+            self._capture = cv2.VideoCapture(source, cv2.CAP_ANY)
         if not self._capture.isOpened():
-            raise OSError(
-                f"camera {self._name}: no answer within {NETWORK_TIMEOUT:g} s; check address, user and password"
-                if "://" in self._name
-                else f"camera {self._name}: cannot be opened; is it in use by another program?"
-            )
+            raise OSError(f"camera {source}: cannot be opened; is it in use by another program?")
+        # The pixel format first: which sizes and rates there are depends on it. What came of size and rate is seen in
+        # the frames.
+        for what, value in (
+            (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*pixel_format) if pixel_format else 0),
+            (cv2.CAP_PROP_FRAME_WIDTH, width_px),
+            (cv2.CAP_PROP_FRAME_HEIGHT, height_px),
+            (cv2.CAP_PROP_FPS, frame_rate_hz),
+            # V4L2_EXPOSURE_MANUAL: in the dark the automatic lengthens the exposure until all is blur.
+            (cv2.CAP_PROP_AUTO_EXPOSURE, 1.0 if exposure or gain else 0.0),
+        ):
+            if value:
+                self._capture.set(what, value)
+        granted = self._fix("exposure_ms", cv2.CAP_PROP_EXPOSURE, 1e3 * exposure, unit=_EXPOSURE_UNIT_MS)
+        # s, nan where the camera chooses it
+        self._exposure = exposure if exposure and granted else math.nan
+        self._fix("gain", cv2.CAP_PROP_GAIN, gain)
+
+    def _fix(self, key: str, what: int, value: float, unit: float = 1.0) -> bool:
+        """Fix a control at `value`, where that is not 0; whether the camera has taken it."""
+        if not value:
+            return True
+        wanted = float(round(value / unit))
+        self._capture.set(what, wanted)
+        found = self._capture.get(what)
+        if found == wanted:
+            return True
+        _log.warning("camera %s: %s = %g was asked for, it says %g", self._name, key, value, found * unit)
+        return False
 
     def grab(self) -> Frame:
+        """See Device. `t` is the driver's stamp where it has one, else the arrival."""
         if not self._capture.grab():
             raise OSError(f"camera {self._name}: lost; it no longer delivers frames")
-        now = time.monotonic()
-        # V4L2 reports the driver's own stamp here, on the monotonic clock; other backends the time in the stream.
-        driver = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+        clocks = host_clocks()
+        # With V4L2 this is the buffer's stamp; elsewhere the time since the start, or nothing.
+        stamped = host_time(1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC), clocks)
         ok, image = self._capture.retrieve()
         if not ok:
             raise OSError(f"camera {self._name}: lost; it delivers frames that cannot be decoded")
-        return Frame(driver if 0.0 <= now - driver < 1.0 else now, np.asarray(image))
+        t, clock = stamped or (clocks["monotonic"], "")
+        if clock != self._clock:
+            self._clock = clock
+            how = f"by the driver, on the {clock} clock" if clock else "on arrival, some ms late: the driver does not"
+            _log.info("camera %s: frames are stamped %s", self._name, how)
+        if clock and math.isfinite(self._exposure):
+            # USB cameras' driver, uvcvideo, stamps the start of the exposure (V4L2_BUF_FLAG_TSTAMP_SRC_SOE).
+            t += 0.5 * self._exposure
+        return Frame(t, np.asarray(image), exposure=self._exposure)
 
     def close(self) -> None:
         self._capture.release()
 
 
+class NetworkCamera:
+    """A network camera's stream, such as rtsp://..., through FFmpeg."""
+
+    def __init__(self, url: str) -> None:
+        self._name = without_password(url)
+        limit = int(1000.0 * NETWORK_TIMEOUT)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
+        with _stderr_silenced():
+            self._capture = cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits)
+        if not self._capture.isOpened():
+            raise OSError(
+                f"camera {self._name}: no answer within {NETWORK_TIMEOUT:g} s; check address, user and password"
+            )
+
+    def grab(self) -> Frame:
+        """See Device. `t` is the arrival: what the network and the camera's encoder take is in no stamp."""
+        if not self._capture.grab():
+            raise OSError(f"camera {self._name}: lost; it no longer delivers frames")
+        arrival = time.monotonic()
+        ok, image = self._capture.retrieve()
+        if not ok:
+            raise OSError(f"camera {self._name}: lost; it delivers frames that cannot be decoded")
+        return Frame(arrival, np.asarray(image))
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def without_password(url: str) -> str:
+    """An address as it may be shown: `rtsp://user:***@host/stream`."""
+    return re.sub(r"(?<=://)([^/@:]*):[^/@]*@", r"\1:***@", url)
+
+
 def _check_device(path: Path) -> None:
     """Raises OSError with what OpenCV does not say: which cameras there are, or that permission is missing."""
     if not path.exists():
-        there = ", ".join(str(device) for device in sorted(path.parent.glob("video*"))) or "none"
+        there = ", ".join(str(device) for device in sorted(Path("/dev").glob("video*"))) or "none"
         raise FileNotFoundError(f"camera {path}: not there; cameras found: {there}")
     if not os.access(path, os.R_OK | os.W_OK):
         raise PermissionError(f"camera {path}: no permission; add the user to the group `video`")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import time
+import logging
+import math
 from typing import Any
 
 import numpy as np
@@ -10,16 +11,33 @@ from numpy.typing import NDArray
 
 from camera.capture import Frame
 from camera.markers import Image
+from camera.stamp import host_clocks, host_time
 
-# 5 ms: at 1 m/s a marker moves 5 mm. Fixed, because automatic exposure lengthens it in the dark until all is blur.
-EXPOSURE_US = 5000
+# s, where none is asked for: at 1 m/s a marker moves 5 mm. Fixed, because the automatic lengthens it in the dark until
+# all is blur.
+EXPOSURE = 0.005
 GAIN = 4.0
+SIZE_PX = (1280, 960)
+# s without a frame after which it is lost.
+TIMEOUT = 5.0
+
+_log = logging.getLogger(__name__)
 
 
 class PiCamera:
-    """A Device of `camera.capture`. Raises OSError if picamera2 or the camera is missing."""
+    """A Device of `camera.capture`, with fixed exposure (s) and gain; 0 for what stands above.
 
-    def __init__(self, width_px: int = 0, height_px: int = 0, frame_rate_hz: float = 0.0) -> None:
+    Raises OSError if picamera2 or the camera is missing.
+    """
+
+    def __init__(
+        self,
+        width_px: int = 0,
+        height_px: int = 0,
+        frame_rate_hz: float = 0.0,
+        exposure: float = 0.0,
+        gain: float = 0.0,
+    ) -> None:
         try:
             from picamera2 import Picamera2
         except ImportError as error:
@@ -28,19 +46,29 @@ class PiCamera:
                 "python3-picamera2 --no-install-recommends`, and make the virtual environment with "
                 "--system-site-packages. On other machines use a USB camera (source = 0)"
             ) from None
-        self._size = (width_px or 1280, height_px or 960)
+        self._clock: str | None = None
+        self._asked = exposure or EXPOSURE
         try:
             self._camera: Any = Picamera2()
-            controls = {"AeEnable": False, "ExposureTime": EXPOSURE_US, "AnalogueGain": GAIN}
+            controls = {
+                "AeEnable": False,
+                "ExposureTime": round(1e6 * self._asked),
+                "AnalogueGain": gain or GAIN,
+            }
             if frame_rate_hz:
                 controls["FrameRate"] = frame_rate_hz
             if "LensPosition" in self._camera.camera_controls:
                 # Locked at infinity: a lens that hunts changes the calibration.
                 controls |= {"AfMode": 0, "LensPosition": 0.0}
             configuration = self._camera.create_video_configuration(
-                main={"format": "YUV420", "size": self._size}, buffer_count=4, queue=False, controls=controls
+                main={"format": "YUV420", "size": (width_px or SIZE_PX[0], height_px or SIZE_PX[1])},
+                buffer_count=4,
+                queue=False,
+                controls=controls,
             )
             self._camera.configure(configuration)
+            # What it has made of the wish.
+            self._size: tuple[int, int] = self._camera.camera_configuration()["main"]["size"]
             self._camera.start()
         except (RuntimeError, IndexError) as error:
             raise OSError(
@@ -48,13 +76,11 @@ class PiCamera:
             ) from None
 
     def grab(self) -> Frame:
-        """Mid-exposure of the first row, and the grey values. Raises OSError when the camera is lost.
-
-        The other rows follow at the sensor's line time; that of the middle row is a constant which the configuration's
-        `time_offset` takes.
-        """
+        """See Device. The other rows follow the first at the sensor's line time."""
         try:
-            request = self._camera.capture_request()
+            request = self._camera.capture_request(wait=TIMEOUT)
+        except TimeoutError:
+            raise OSError(f"camera picamera: lost; no frame for {TIMEOUT:g} s") from None
         except RuntimeError as error:
             raise OSError(f"camera picamera: lost ({error})") from None
         try:
@@ -63,10 +89,19 @@ class PiCamera:
             image = y_plane(request.make_array("main"), *self._size)
         finally:
             request.release()
-        monotonic, boottime = time.monotonic_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-        end_of_exposure = host_time(metadata["SensorTimestamp"], monotonic, boottime)
-        exposure = 1e-6 * metadata["ExposureTime"]
-        return Frame(end_of_exposure - 0.5 * exposure, image, exposure=exposure)
+        clocks = host_clocks()
+        exposure = 1e-6 * metadata.get("ExposureTime", math.nan)
+        # The sensor's stamp is of the first row's readout, which ends its exposure.
+        stamped = host_time(1e-9 * metadata.get("SensorTimestamp", math.nan), clocks)
+        t, clock = stamped or (clocks["monotonic"], "")
+        if clock != self._clock:
+            if self._clock is None and not math.isclose(exposure, self._asked, rel_tol=0.05):
+                text = "camera picamera: exposure_ms = %g was asked for, it has %g; the frame rate limits it"
+                _log.warning(text, 1e3 * self._asked, 1e3 * exposure)
+            self._clock = clock
+            how = f"by the sensor, on the {clock} clock" if clock else "on arrival: the sensor's stamp fits no clock"
+            _log.info("camera picamera: frames are stamped %s", how)
+        return Frame(t - 0.5 * exposure if math.isfinite(exposure) else t, image, exposure=exposure)
 
     def close(self) -> None:
         self._camera.stop()
@@ -76,14 +111,3 @@ class PiCamera:
 def y_plane(yuv420: NDArray[np.uint8], width_px: int, height_px: int) -> Image:
     """The grey image out of a planar YUV420 buffer (rows, stride): its first `height_px` rows, padding cut off."""
     return np.ascontiguousarray(yuv420[:height_px, :width_px])
-
-
-def host_time(sensor_timestamp_ns: int, monotonic_ns: int, boottime_ns: int) -> float:
-    """A sensor's stamp -> s on the host's monotonic clock, given both of the host's clocks now.
-
-    libcamera documents SensorTimestamp as CLOCK_BOOTTIME, drivers report CLOCK_MONOTONIC: they differ by the time that
-    the machine was suspended. A frame is never from the future and rarely older than a second, which tells them apart.
-    """
-    ages = (monotonic_ns - sensor_timestamp_ns, boottime_ns - sensor_timestamp_ns)
-    age = min(age for age in ages if age >= 0) if max(ages) >= 0 else 0
-    return 1e-9 * (monotonic_ns - age)

@@ -55,6 +55,14 @@ class CameraConfig(Struct, frozen=True, forbid_unknown_fields=True):
     width_px: Annotated[int, Meta(ge=0, le=20000)] = 0
     height_px: Annotated[int, Meta(ge=0, le=20000)] = 0
     frame_rate_hz: RateOrNone = 0.0
+    pixel_format: Annotated[str, Meta(pattern=r"^([A-Za-z0-9]{4})?$")] = ""
+    """Of a USB camera, such as MJPG; "": the camera's own."""
+    exposure_ms: Annotated[float, Meta(ge=0.0, le=1000.0)] = 0.0
+    """0: the camera's own, which is fixed for the Pi's and automatic for others."""
+    gain: Annotated[float, Meta(ge=0.0, le=10000.0)] = 0.0
+    """A factor for the Pi's camera, the driver's own number for others; 0: the camera's own."""
+    line_time: Annotated[float, Meta(ge=0.0, le=0.001)] = 0.0
+    """s from one row's exposure to the next one's; 0: all together."""
     time_offset: Annotated[float, Meta(ge=-2.0, le=2.0)] = 0.0
     """s, added to the stamps of its frames."""
 
@@ -115,6 +123,10 @@ _RIGHT = {
     "width_px": "a whole number of pixels, 0 for the camera's own",
     "height_px": "a whole number of pixels, 0 for the camera's own",
     "frame_rate_hz": "frames a second, 0 for the camera's own",
+    "pixel_format": 'four letters for a USB camera, such as "MJPG", or "" for the camera\'s own',
+    "exposure_ms": "milliseconds up to 1000, 0 for the camera's own",
+    "gain": "a number of 0 or more, 0 for the camera's own",
+    "line_time": "seconds between two rows of the image, such as 19e-6; 0 where all are exposed together",
     "time_offset": "seconds, -2 to 2, added to the camera's stamps",
     "id": "the number of the marker in its dictionary, 0 or more",
     "size_mm": "the side of the marker's black square in millimetres, 5 to 2000",
@@ -126,7 +138,8 @@ _RIGHT = {
     "baud": "the speed of the serial line in bits a second, such as 115200",
 }
 _SOURCE = {
-    "camera": 'a camera number, "/dev/video0", "rtsp://...", a video file, a folder of images or "picamera"',
+    "camera": 'a camera number, "/dev/video0", "rtsp://...", a video file, a folder of images, "picamera", or "remote" '
+    "for one on another machine",
     "robot": '"websocket" or a serial port such as "/dev/ttyUSB0"',
 }
 
@@ -163,8 +176,9 @@ def parse(text: str, name: str = "configuration", folder: Path = Path()) -> Conf
 
 def _with_absolute_paths(camera: CameraConfig, folder: Path) -> CameraConfig:
     source = camera.source
-    if isinstance(source, str) and source != "picamera" and "://" not in source and not source.isdecimal():
-        source = str((folder / source).absolute())
+    is_path = isinstance(source, str) and "://" not in source and not source.isdecimal()
+    if is_path and source not in ("picamera", "remote"):
+        source = str((folder / str(source)).absolute())
     calibration = str((folder / camera.calibration).absolute())
     return msgspec.structs.replace(camera, source=source, calibration=calibration)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from camera import capture
-from camera.capture import FileSource, Frame, LiveSource, open_source, read_image
+from camera.capture import FileSource, Frame, LiveSource, V4l2Device, open_source, read_image, without_password
 
 WAIT = 20.0
 
@@ -197,3 +197,96 @@ def test_silence_is_lifted_again(capfd):
 
     os.write(2, b"heard\n")
     assert capfd.readouterr().err == "heard\n"
+
+
+class Webcam:
+    """OpenCV's VideoCapture over a USB camera, as far as the driver's side of it is known. Numbers by property."""
+
+    def __init__(self, age=0.02, refuses=()):
+        self.age, self.refuses = age, refuses
+        self.set_in_order = []
+        self.values = {cv2.CAP_PROP_EXPOSURE: 157.0, cv2.CAP_PROP_GAIN: 64.0}
+        self.there = True
+
+    def __call__(self, source, backend):
+        return self
+
+    def isOpened(self):
+        return True
+
+    def set(self, what, value):
+        self.set_in_order.append(what)
+        if what in self.refuses:
+            return False
+        self.values[what] = value
+        return True
+
+    def get(self, what):
+        if what == cv2.CAP_PROP_POS_MSEC:
+            return 1e3 * (time.monotonic() - self.age)
+        return self.values.get(what, 0.0)
+
+    def grab(self):
+        return self.there
+
+    def retrieve(self):
+        return True, np.zeros((48, 64, 3), np.uint8)
+
+    def release(self):
+        self.there = False
+
+
+def test_a_usb_camera_is_set_up_and_stamps_mid_exposure(monkeypatch, caplog):
+    caplog.set_level(logging.INFO)
+    webcam = Webcam()
+    monkeypatch.setattr(cv2, "VideoCapture", webcam)
+    camera = V4l2Device(0, 640, 480, 30.0, "MJPG", exposure=0.004, gain=20.0)
+    assert webcam.set_in_order == [
+        cv2.CAP_PROP_FOURCC,
+        cv2.CAP_PROP_FRAME_WIDTH,
+        cv2.CAP_PROP_FRAME_HEIGHT,
+        cv2.CAP_PROP_FPS,
+        cv2.CAP_PROP_AUTO_EXPOSURE,
+        cv2.CAP_PROP_EXPOSURE,
+        cv2.CAP_PROP_GAIN,
+    ]
+    assert webcam.values[cv2.CAP_PROP_AUTO_EXPOSURE] == 1.0
+    assert webcam.values[cv2.CAP_PROP_EXPOSURE] == 40.0, "in units of 0.1 ms"
+    begin = time.monotonic()
+    frame = camera.grab()
+    assert frame.exposure == 0.004
+    # The driver stamped the start of the exposure.
+    assert begin - 0.02 + 0.002 <= frame.t <= time.monotonic() - 0.02 + 0.002
+    camera.grab()
+    (record,) = caplog.records
+    assert record.getMessage() == "camera 0: frames are stamped by the driver, on the monotonic clock"
+    webcam.there = False
+    with pytest.raises(OSError, match="camera 0: lost; it no longer delivers frames"):
+        camera.grab()
+
+
+def test_a_usb_camera_that_does_not_take_its_exposure_says_so(monkeypatch, caplog):
+    monkeypatch.setattr(cv2, "VideoCapture", Webcam(age=1000.0, refuses=(cv2.CAP_PROP_EXPOSURE,)))
+    camera = V4l2Device(0, exposure=0.004)
+    (record,) = caplog.records
+    assert record.getMessage() == "camera 0: exposure_ms = 4 was asked for, it says 15.7"
+    begin = time.monotonic()
+    frame = camera.grab()
+    assert np.isnan(frame.exposure)
+    assert begin <= frame.t <= time.monotonic(), "a stamp that fits no clock is not believed"
+
+
+def test_a_usb_camera_is_left_alone_where_nothing_is_asked(monkeypatch):
+    webcam = Webcam()
+    monkeypatch.setattr(cv2, "VideoCapture", webcam)
+    V4l2Device(0)
+    assert webcam.set_in_order == []
+
+
+def test_passwords_are_not_shown():
+    assert without_password("rtsp://admin:secret@10.0.0.5:554/h264?x=a:b@c") == (
+        "rtsp://admin:***@10.0.0.5:554/h264?x=a:b@c"
+    )
+    assert without_password("rtsp://10.0.0.5/h264") == "rtsp://10.0.0.5/h264"
+    with pytest.raises(OSError, match=r"^camera rtsp://me:\*\*\*@127\.0\.0\.1:1/s: no answer"):
+        open_source("rtsp://me:secret@127.0.0.1:1/s")
