@@ -18,9 +18,12 @@ from fusion.params import GRAVITY
 from fusion.simulator import (
     CameraParams,
     ImuParams,
+    MarkerParams,
     Simulation,
     Trajectory,
     TriadParams,
+    WheelParams,
+    WrongMarker,
     aggressive,
     figure_eight,
     random_ground,
@@ -219,6 +222,158 @@ def test_a_flip_is_the_other_pose_of_a_flat_marker() -> None:
         np.testing.assert_allclose(across @ a[:, :2], across @ b[:, :2], atol=1e-12)
     alone = simulate(course, 4, 60.0, camera=replace(camera, two_poses=False))
     np.testing.assert_array_equal(fix_errors(alone, course), fix_errors(simulation, course))
+
+
+def pixels(position: Array, attitude: Rotation, marker: MarkerParams, camera: tuple[float, float, float]) -> Array:
+    """(4, 2): where a camera that looks straight down has the corners of a marker."""
+    half = 0.5 * marker.size
+    corners = position + attitude.apply([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+    below = camera[2] - corners[:, 2:]
+    return marker.focal_px * (corners[:, :2] - camera[:2]) / below
+
+
+@pytest.mark.parametrize("on_floor", [True, False])
+@pytest.mark.parametrize("field", [0.0, 0.6])
+def test_errors_from_the_picture_are_as_large_as_their_covariance(on_floor: bool, field: float) -> None:
+    """Over 60 runs, since of what is drawn once for each, six or twelve numbers, there are only so many."""
+    marker = MarkerParams(on_floor=on_floor, field_sigma_px=field, field_length_px=150.0)
+    values = []
+    for seed in range(60):
+        course = random_ground(seed) if on_floor else aggressive(seed)
+        camera = CameraParams(rate=5.0, marker=marker, position=(0.3, -0.2, 4.0))
+        simulation = simulate(course, seed, 12.0, camera=camera)
+        covariances = np.array([fix.hypotheses[0].covariance for fix in simulation.fixes])
+        values.append(nees(fix_errors(simulation, course), covariances).mean())
+    assert np.mean(values) == pytest.approx(6.0, rel=0.08 if not on_floor else 0.16)
+
+
+def test_errors_from_the_picture_are_those_that_the_corners_have() -> None:
+    """The fixed pose, projected anew, has its corners where they were seen, but for two of their eight coordinates."""
+    course = random_ground(1)
+    sigma = 1e-3  # so small that what is not linear does not matter
+    for on_floor, spent in ((False, 6), (True, 3)):
+        marker = MarkerParams(corner_sigma_px=sigma, on_floor=on_floor, height_sigma=1e-9, tilt_sigma=1e-9)
+        camera = CameraParams(rate=20.0, marker=marker)
+        simulation = simulate(course, 1, 30.0, camera=camera)
+        squares = []
+        for fix in simulation.fixes:
+            pose, truth = fix.hypotheses[0], course.at([fix.t])
+            fixed = Rotation.from_quat(pose.quaternion_wxyz, scalar_first=True)
+            off = pixels(pose.position, fixed, marker, camera.position)
+            off = off - pixels(truth.position[0], truth.attitude[0], marker, camera.position)
+            squares.append(np.sum((off / sigma) ** 2))
+        assert np.mean(squares) == pytest.approx(spent, rel=0.08)
+
+
+def test_an_error_that_depends_on_the_place_repeats_while_the_robot_stands() -> None:
+    course = random_ground(2)
+    marker = MarkerParams(corner_sigma_px=1e-6, field_sigma_px=0.5, height_sigma=1e-9, tilt_sigma=1e-9)
+    simulation = simulate(course, 2, 150.0, camera=CameraParams(rate=10.0, marker=marker))
+    t = np.array([fix.t for fix in simulation.fixes])
+    errors = fix_errors(simulation, course)[:, [0, 1, 5]]
+    stops = [errors[(t % 15.0 > 12.2) & (t // 15.0 == i)] for i in range(10)]
+    assert max(np.ptp(stop, axis=0).max() for stop in stops) < 1e-6
+    assert np.std([stop[0] for stop in stops], axis=0).min() > 1e-4
+    assert np.abs(errors).max() < 0.02
+
+
+def test_what_is_taken_for_the_height_counts_most_beside_the_camera() -> None:
+    course = figure_eight()
+    marker = MarkerParams(corner_sigma_px=1e-6, height_sigma=0.01, tilt_sigma=1e-9)
+    simulation = simulate(course, 3, 30.0, camera=CameraParams(rate=10.0, marker=marker, position=(0.0, 0.0, 2.5)))
+    errors = fix_errors(simulation, course)
+    height = -errors[0, 2]  # of the marker above where it is taken to be
+    assert 1e-4 < abs(height) < 0.04
+    np.testing.assert_allclose(errors[:, 2], -height)
+    # By similar triangles. The covariance is the same with the height's sigma.
+    x = course.at(np.array([fix.t for fix in simulation.fixes])).position[:, 0]
+    np.testing.assert_allclose(errors[:, 0], height * x / 2.5, atol=1e-7)
+    sigma = np.sqrt([fix.hypotheses[0].covariance[0, 0] for fix in simulation.fixes])
+    np.testing.assert_allclose(sigma, 0.01 * np.abs(x) / 2.5, atol=1e-7)
+
+
+def test_a_camera_below_the_course_is_refused() -> None:
+    camera = CameraParams(marker=MarkerParams(), position=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="rises to the camera at 0 m"):
+        simulate(aggressive(1), 1, 10.0, camera=camera)
+
+
+def test_a_marker_that_is_entered_wrongly_is_wrong_whenever_it_is_in_view() -> None:
+    course = random_ground(3)
+    wrong = WrongMarker(turn=math.pi, shift=(0.2, -0.1, 0.0), share=0.3, run=8.0)
+    camera = CameraParams(rate=10.0)
+    simulation = simulate(course, 3, 300.0, camera=replace(camera, wrong=wrong))
+    plain = simulate(course, 3, 300.0, camera=camera)
+    assert {fix.markers for fix in simulation.fixes} == {(1,), (7,)}
+    assert {fix.markers for fix in plain.fixes} == {()}
+    this = np.array([fix.markers == (7,) for fix in simulation.fixes])
+    assert this.mean() == pytest.approx(0.3, abs=0.03)
+    for marked, fix, as_it_is in zip(this, simulation.fixes, plain.fixes, strict=True):
+        there, here = fix.hypotheses[0], as_it_is.hypotheses[0]
+        a, b = (Rotation.from_quat(pose.quaternion_wxyz, scalar_first=True) for pose in (here, there))
+        np.testing.assert_allclose(
+            a.inv().apply(there.position - here.position), [0.2, -0.1, 0.0] if marked else 0.0, atol=1e-12
+        )
+        assert (a.inv() * b).magnitude() == pytest.approx(math.pi if marked else 0.0, abs=1e-6)
+    changes = np.flatnonzero(np.diff(this[np.argsort([fix.t for fix in simulation.fixes])]))
+    runs = np.diff(changes)[::2] / 10.0
+    assert len(runs) >= 9
+    assert 7.0 < runs.min() < runs.max() < 9.0
+    always = simulate(course, 3, 20.0, camera=replace(camera, wrong=replace(wrong, share=1.0)))
+    assert {fix.markers for fix in always.fixes} == {(7,)}
+
+
+def test_an_imu_beside_the_origin_feels_its_own_acceleration() -> None:
+    arm = np.array([0.1, -0.2, 0.05])
+    simulation = simulate(aggressive(4), 0, 20.0, replace(PERFECT, lever_arm=tuple(arm)))
+
+    def place(t: Array) -> Array:
+        motion = aggressive(4).at(t)
+        return motion.position + motion.attitude.apply(arm)
+
+    t, h = simulation.samples[1:, 0], 1e-3
+    acceleration = (place(t + h) - 2.0 * place(t) + place(t - h)) / h**2
+    force = aggressive(4).at(t).attitude.apply(acceleration + [0.0, 0.0, GRAVITY], inverse=True)
+    np.testing.assert_allclose(simulation.samples[1:, 4:], force, atol=1e-2)
+    np.testing.assert_array_equal(simulation.samples[:, 1:4], simulate(aggressive(4), 0, 20.0, PERFECT).samples[:, 1:4])
+
+
+def wheel_errors(wheels: WheelParams, seed: int = 0) -> tuple[Array, Array]:
+    """Errors (n, 2) of the left and right wheel's speed, and those speeds."""
+    course = random_ground(seed)
+    odometry = simulate(course, seed, 120.0, wheels=wheels).wheels
+    motion = course.at(odometry[:, 0])
+    speed, rate = np.linalg.norm(motion.velocity, axis=1), motion.rate[:, 2]
+    read, true = (
+        np.column_stack([v - 0.5 * wheels.track * w, v + 0.5 * wheels.track * w])
+        for v, w in ((odometry[:, 1], odometry[:, 2]), (speed, rate))
+    )
+    return read - true, true
+
+
+def test_wheels() -> None:
+    assert simulate(random_ground(0), 0, 5.0).wheels.shape == (0, 3)
+    error, true = wheel_errors(WheelParams(noise=0.0))
+    assert len(error) == 6000
+    np.testing.assert_allclose(error, 0.0, atol=1e-12)
+    error, _ = wheel_errors(WheelParams(noise=0.01))
+    assert error.std(axis=0) == pytest.approx([0.01, 0.01], rel=0.05)
+    scales = []
+    for seed in range(40):
+        error, true = wheel_errors(WheelParams(noise=0.0, scale_sigma=0.02), seed)
+        scale = np.sum(error * true, axis=0) / np.sum(true**2, axis=0)
+        np.testing.assert_allclose(error, true * scale, atol=1e-12)
+        scales.append(scale)
+    assert np.std(scales) == pytest.approx(0.02, rel=0.2)
+
+
+def test_wheels_that_slip() -> None:
+    error, true = wheel_errors(WheelParams(noise=0.0, slip_rate=0.1, slip_time=0.4, slip=0.5))
+    slipping = np.abs(error) > 1e-9
+    np.testing.assert_allclose(error[slipping], 0.5 * true[slipping])
+    assert slipping.any(axis=0).all()
+    # 0.1 a second for 0.4 s, of which a fifth falls into stops.
+    assert slipping.any(axis=1).mean() == pytest.approx(0.04 * 0.8, abs=0.02)
 
 
 def test_the_filter_with_matched_noise_is_as_good_as_it_says() -> None:
