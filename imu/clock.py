@@ -32,8 +32,10 @@ JUMP = 0.03
 # s: arrivals that are later than the line by more, without a single better one for LATE_FOR, mean a jump as well (a
 # device that slept and whose clock stood still); less is a network having a bad time.
 LATE = 0.25
-LATE_FOR = 2.0
-# Round trips kept, and by how much (s per s of age) an older one is trusted less: the error of the slope.
+LATE_FOR = 1.5
+# s: where counters start again from zero: ticks of 1 ns, 1 us and 1 ms in 16, 24 or 32 bits, the day, the GPS week.
+WRAPS = (2**32 * 1e-9, 2**24 * 1e-6, 2**16 * 1e-3, 2**32 * 1e-6, 2**24 * 1e-3, 86400.0, 604800.0, 2**32 * 1e-3)
+# Questions kept, and by how much (s per s of age) an older one is trusted less: the error of the slope.
 EXCHANGES = 64
 AGEING = 1e-5
 # s: the distance between samples that arrive together and bring no stamps, where nothing better is known because the
@@ -48,21 +50,25 @@ MONOTONE_STEP = 1e-6
 Reading = tuple[float | None, float, float, float, float, float, float]
 
 
-class _Exchange(NamedTuple):
-    device: float
-    host: float
-    round_trip: float
+class _Question(NamedTuple):
+    """When the host sent it, and when the device received it by its own clock."""
+
+    sent: float
+    received: float
 
 
 class DeviceClock:
     """Maps one device's clock to the host's. No I/O: arrival times are arguments, host monotonic s.
 
-    `restarts` counts the jumps and reboots of the device's clock that were seen. `skew` is the slope of the mapping
-    less one: positive where the device's clock is slow. `minimum_delay`: s, by the best round trip; None without one.
+    `restarts` counts the jumps and reboots of the device's clock that were seen; a counter that starts again from zero
+    where its digits end is neither. `skew` is the slope of the mapping less one: positive where the device's clock is
+    slow. `minimum_delay`: s, half the best round trip; None without one. `has_stamps`: whether the device stamps its
+    samples at all; where it does not, their times are no better than those of their arrival. None before the first.
     """
 
     def __init__(self) -> None:
         self.restarts = 0
+        self.has_stamps: bool | None = None
         self.skew = 0.0
         self._last_stamp = -math.inf
         self._last_arrival = -math.inf
@@ -78,18 +84,32 @@ class DeviceClock:
         self._newest = -math.inf
         self._suspect = False
         self._late_since = math.inf
-        self._exchanges: deque[_Exchange] = deque(maxlen=EXCHANGES)
-        self._best: _Exchange | None = None
+        self._questions: deque[_Question] = deque(maxlen=EXCHANGES)
+        self._best: _Question | None = None
+        # s after which the device's counter starts again from zero; inf until it has been seen to.
+        self._wrap = math.inf
 
     @property
     def minimum_delay(self) -> float | None:
-        return None if self._best is None else max(0.0, self._line(self._best.device) - self._best.host)
+        return None if self._best is None else max(0.0, 0.5 * (self._line(self._best.received) - self._best.sent))
 
     def observe(self, device_time: float, arrival: float) -> None:
         """A sample that the device stamped reached the host at `arrival`. Samples come in the order they were taken."""
-        self._observe(device_time, arrival, back=device_time < self._newest - JUMP)
+        unwrapped = self._unwrap(device_time, self._device(arrival))
+        if unwrapped < self._newest - JUMP:
+            for wrap in WRAPS:
+                if self._newest < wrap and -JUMP <= arrival - self._line(device_time + wrap) <= LATE:
+                    self._wrap = wrap
+                    unwrapped = device_time + wrap
+        self._observe(unwrapped, arrival, back=unwrapped < self._newest - JUMP)
         if not self._suspect:
-            self._newest = max(self._newest, device_time)
+            self._newest = max(self._newest, unwrapped)
+
+    def _unwrap(self, device_time: float, near: float) -> float:
+        """`device_time` on a counter without end, where it is nearest to `near`."""
+        if self._wrap == math.inf:
+            return device_time
+        return device_time + self._wrap * round((near - device_time) / self._wrap)
 
     def _observe(self, device_time: float, arrival: float, *, back: bool = False) -> None:
         if self._origin is None:
@@ -125,12 +145,14 @@ class DeviceClock:
 
     def exchange(self, sent: float, received_device: float, sent_device: float, arrival: float) -> None:
         """The host sent at `sent`, the device received and answered by its own clock, the answer came at `arrival`."""
+        received_device, sent_device = (self._unwrap(t, self._device(arrival)) for t in (received_device, sent_device))
         # Not `observe`: samples that were waiting for their batch to fill follow, and are older.
         self._observe(sent_device, arrival)
         round_trip = (arrival - sent) - (sent_device - received_device)
-        if round_trip < 0.0 or sent_device < received_device or self._suspect:
+        there = self._line(received_device) - sent
+        if there < 0.0 or round_trip < 0.0 or sent_device < received_device or self._suspect:
             return
-        self._exchanges.append(_Exchange(0.5 * (received_device + sent_device), 0.5 * (sent + arrival), round_trip))
+        self._questions.append(_Question(sent, received_device))
         self._choose()
 
     def to_host(self, device_time: float) -> float:
@@ -139,14 +161,12 @@ class DeviceClock:
         nan before the first observation.
         """
         delay = self.minimum_delay
-        return self._line(device_time) - (delay or 0.0)
+        return self._line(self._unwrap(device_time, self._newest)) - (delay or 0.0)
 
     def to_device(self, t: float) -> float:
         """The device's time at host time `t`, the inverse of `to_host`; nan before the first observation."""
-        if self._origin is None:
-            return math.nan
-        line = t + (self.minimum_delay or 0.0)
-        return self._origin[0] + (line - self._origin[1] - self._offset) / (1.0 + self.skew)
+        device_time = self._device(t + (self.minimum_delay or 0.0))
+        return device_time if self._wrap == math.inf else device_time % self._wrap
 
     def stamp(self, samples: Sequence[Reading], arrival: float) -> Array:
         """Samples that arrived together, oldest first -> (n, 7), host time and readings, as an `ImuBatch` takes them.
@@ -156,6 +176,7 @@ class DeviceClock:
         since the last arrival: all that is known of them.
         """
         for device_time, *_ in samples:
+            self.has_stamps = device_time is not None
             if device_time is not None:
                 self.observe(device_time, arrival)
         n = len(samples)
@@ -177,6 +198,12 @@ class DeviceClock:
         x = device_time - self._origin[0]
         return self._origin[1] + x + self._offset + self.skew * x
 
+    def _device(self, arrival: float) -> float:
+        """The device's time on the line at `arrival`, on a counter without end."""
+        if self._origin is None:
+            return math.nan
+        return self._origin[0] + (arrival - self._origin[1] - self._offset) / (1.0 + self.skew)
+
     def _restart(self, device_time: float, arrival: float) -> None:
         self.restarts += 1
         self._forget()
@@ -196,8 +223,10 @@ class DeviceClock:
         self._choose()
 
     def _choose(self) -> None:
-        newest = self._newest
-        self._best = min(self._exchanges, key=lambda e: e.round_trip + AGEING * (newest - e.device), default=None)
+        """The question that was the quickest on its way there."""
+        self._best = min(
+            self._questions, key=lambda q: self._line(q.received) - q.sent - AGEING * q.received, default=None
+        )
 
 
 def _hull_slope(points: Sequence[tuple[float, float]]) -> float:
