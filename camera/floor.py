@@ -1,11 +1,22 @@
-"""Where a camera hangs: world_from_camera from anchor markers at surveyed places."""
+"""Where a camera hangs: world_from_camera from anchor markers at surveyed places, and its file.
+
+The file is TOML, written by `steadfix floor`:
+
+    world_from_camera = [[...], [...], [...], [0.0, 0.0, 0.0, 1.0]]     # 4 x 4, m
+    covariance = [[...], ...]               # 6 x 6: position (m) and rotation (rad), along world axes
+    anchors = [40, 41, 42, 43]              # that it was found from
+    rms_px = 0.12                           # of their corners
+"""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from camera.calibration import Intrinsics
@@ -43,6 +54,56 @@ class Placement:
     covariance: Array
     rms_px: float
     anchors_seen: tuple[int, ...]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    world_from_camera: list[list[float]]
+    covariance: list[list[float]]
+    anchors: list[int]
+    rms_px: float
+
+
+def load_placement(path: str | os.PathLike[str]) -> Placement:
+    """Reads a placement file. Raises PlacementError naming file and key, OSError if it cannot be read."""
+    try:
+        content = msgspec.toml.decode(Path(path).read_text(encoding="utf-8"), type=_File)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise PlacementError(f"{path}: {error}") from None
+    pose, covariance = _matrix(content.world_from_camera, 4), _matrix(content.covariance, 6)
+    if (
+        pose is None
+        or np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 1e-6
+        or np.linalg.det(pose[:3, :3]) < 0.0
+        or pose[3].tolist() != [0.0, 0.0, 0.0, 1.0]
+    ):
+        raise PlacementError(
+            f"{path}: world_from_camera: a 4 x 4 rigid transform is needed, as `steadfix floor` writes it"
+        )
+    if (
+        covariance is None
+        or np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max()
+        or np.linalg.eigvalsh(covariance).min() < 0.0
+    ):
+        raise PlacementError(
+            f"{path}: covariance: a symmetric, positive 6 x 6 matrix is needed, as `steadfix floor` writes it"
+        )
+    return Placement(pose, covariance, content.rms_px, tuple(content.anchors))
+
+
+def save_placement(path: str | os.PathLike[str], placement: Placement, comment: str = "") -> None:
+    """Writes a placement file that `load_placement` reads back exactly. Raises OSError if it cannot be written."""
+    lines = [f"# {line}" for line in comment.splitlines()]
+    for key, matrix in (("world_from_camera", placement.world_from_camera), ("covariance", placement.covariance)):
+        lines += [f"{key} = [", *(f"    {row}," for row in matrix.tolist()), "]"]
+    lines += [f"anchors = {list(placement.anchors_seen)}", f"rms_px = {placement.rms_px!r}"]
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _matrix(rows: list[list[float]], size: int) -> Array | None:
+    if [len(row) for row in rows] != [size] * size:
+        return None
+    matrix = np.array(rows)
+    return matrix if np.isfinite(matrix).all() else None
 
 
 def locate_camera(sightings: Sequence[MarkerSighting], anchors: Sequence[Anchor], intrinsics: Intrinsics) -> Placement:

@@ -17,7 +17,7 @@ import numpy as np
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
 from camera.fix import MarkerMount, marker_poses, rays, solve
-from camera.floor import Anchor, Placement, PlacementError, locate_camera
+from camera.floor import Anchor, Placement, PlacementError, load_placement, locate_camera
 from camera.markers import MarkerDetector, MarkerSighting
 from fusion.geometry import log_so3, rotation_about_z, transform
 from fusion.measurements import Array, PoseFix
@@ -97,6 +97,13 @@ class Camera:
                 "them; example-camera.toml, beside example.toml, shows the format and will do for a first try"
             )
         self.intrinsics = load_intrinsics(config.calibration)
+        if config.placement:
+            if not Path(config.placement).is_file():
+                raise ConfigError(
+                    f'camera "{config.name}": there is no placement file {config.placement}; `steadfix floor` writes '
+                    "it, or leave the key out and the camera is located from the anchors in view"
+                )
+            self.placement, self.unlocated = load_placement(config.placement), ""
         self._anchors = [_anchor(anchor) for anchor in room.anchor]
         self._anchor_ids = {anchor.id for anchor in room.anchor}
         self._robots = [
@@ -113,7 +120,7 @@ class Camera:
         # found the camera elsewhere.
         self._looks: list[list[MarkerSighting]] = []
         self._next_look = -math.inf
-        self._settled = False
+        self._settled = self.placement is not None
         self._moved = False
         self._arrivals: deque[float] = deque()
         self._source: FrameSource | None = None

@@ -65,6 +65,9 @@ class CameraConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """s from one row's exposure to the next one's; 0: all together."""
     time_offset: Annotated[float, Meta(ge=-2.0, le=2.0)] = 0.0
     """s, added to the stamps of its frames."""
+    placement: str = ""
+    """Path of where it hangs, as `steadfix floor` writes it; "": found from the anchors in view. `load` makes it
+    absolute."""
 
 
 class AnchorConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -128,6 +131,7 @@ _RIGHT = {
     "gain": "a number of 0 or more, 0 for the camera's own",
     "line_time": "seconds between two rows of the image, such as 19e-6; 0 where all are exposed together",
     "time_offset": "seconds, -2 to 2, added to the camera's stamps",
+    "placement": "the path of a file that `steadfix floor` wrote",
     "id": "the number of the marker in its dictionary, 0 or more",
     "size_mm": "the side of the marker's black square in millimetres, 5 to 2000",
     "position_m": "three numbers [x, y, z] in metres, each within 1000",
@@ -180,7 +184,8 @@ def _with_absolute_paths(camera: CameraConfig, folder: Path) -> CameraConfig:
     if is_path and source not in ("picamera", "remote"):
         source = str((folder / str(source)).absolute())
     calibration = str((folder / camera.calibration).absolute())
-    return msgspec.structs.replace(camera, source=source, calibration=calibration)
+    placement = str((folder / camera.placement).absolute()) if camera.placement else ""
+    return msgspec.structs.replace(camera, source=source, calibration=calibration, placement=placement)
 
 
 def _check(config: Config, source: _Source) -> None:
@@ -202,11 +207,11 @@ def _check(config: Config, source: _Source) -> None:
             once("the marker id", marker.id, ("robot", i, "marker", j, "id"))
         if robot.imu.source != "websocket":
             once("the serial port", robot.imu.source, ("robot", i, "imu", "source"))
-    if config.camera and not config.anchor:
+    if not config.anchor and not all(camera.placement for camera in config.camera):
         raise source.error(
             ("camera",),
             "cameras need anchors: at least one [[anchor]], a marker on the floor at a known place (id, size_mm, "
-            "position_m), tells where the camera is",
+            "position_m), tells where the camera is; or each a `placement`, a file that `steadfix floor` wrote",
         )
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from camera.fix import MarkerMount
-from camera.floor import Anchor, PlacementError, locate_camera
+from camera.floor import Anchor, PlacementError, load_placement, locate_camera, save_placement
 from fusion.geometry import quaternion_from_rotation, rotation_about_z, transform
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA, nees, sight
 
@@ -72,3 +72,36 @@ def test_no_anchor_in_view_is_said_with_what_is():
     stranger = seen([Anchor(3, 0.15, np.eye(4))], np.random.default_rng(8))
     with pytest.raises(PlacementError, match="anchor 40 expected, marker 3 seen"):
         locate_camera(stranger, ANCHORS[:1], INTRINSICS)
+
+
+def test_a_placement_comes_back_exactly_as_it_was_written(tmp_path):
+    written = locate_camera(seen(ANCHORS, np.random.default_rng(9)), ANCHORS, INTRINSICS)
+    save_placement(tmp_path / "ceiling.toml", written, "two lines\nof comment")
+    read = load_placement(tmp_path / "ceiling.toml")
+    np.testing.assert_array_equal(read.world_from_camera, written.world_from_camera)
+    np.testing.assert_array_equal(read.covariance, written.covariance)
+    assert (read.rms_px, read.anchors_seen) == (written.rms_px, written.anchors_seen)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("world_from_camera", "camera_from_world"), "camera_from_world"),
+        (("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 2.0]"), "world_from_camera"),
+        (("    [0.0, 0.0, 0.0, 1.0],\n", ""), "world_from_camera"),
+        (("rms_px = ", "rms_px = 'small' #"), "rms_px"),
+        (("covariance = [\n    [", "covariance = [\n    [nan, "), "covariance"),
+        (("covariance = [\n    [", "covariance = [\n    [-"), "covariance"),
+    ],
+)
+def test_a_wrong_placement_file_is_refused_by_file_and_key(tmp_path, change, says):
+    path = tmp_path / "ceiling.toml"
+    save_placement(path, locate_camera(seen(ANCHORS, np.random.default_rng(9)), ANCHORS, INTRINSICS))
+    text = path.read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change))
+    with pytest.raises(PlacementError) as caught:
+        load_placement(path)
+    assert str(path) in str(caught.value)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
