@@ -13,12 +13,13 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import msgspec
 from msgspec import Meta, Struct
 
 from fusion.params import Engine, FilterParams, Motion
+from server.access import HASHED
 
 DEFAULT_PORT = 5678
 
@@ -44,6 +45,13 @@ class ServerConfig(Struct, frozen=True, forbid_unknown_fields=True):
     port: Annotated[int, Meta(ge=0, le=65535)] = DEFAULT_PORT
     """0: any free one, which the log names."""
     pose_rate_hz: Rate = 50.0
+    token: str = ""
+    """Of those who look on from other machines, plain or `sha256:` and hexadecimal; "": this machine only."""
+    certificate: str = ""
+    key: str = ""
+    """Paths of a TLS certificate (PEM, with its chain) and its key; `load` makes them absolute."""
+    origins: tuple[Text, ...] = ()
+    """Web pages of other addresses that may connect, such as "https://panel.example"."""
 
 
 class CameraConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,6 +103,8 @@ class ImuConfig(Struct, frozen=True, forbid_unknown_fields=True):
 class RobotConfig(Struct, frozen=True, forbid_unknown_fields=True):
     name: Name
     marker: Annotated[tuple[MarkerConfig, ...], Meta(min_length=1)]
+    token: str = ""
+    """What it shows to speak on /v1/robot, plain or `sha256:` and hexadecimal; "": from this machine, without."""
     motion: Motion = "ground"
     engine: Engine = "numba"
     imu: ImuConfig = ImuConfig()
@@ -120,6 +130,10 @@ _RIGHT = {
     "host": 'an address to listen on, such as "127.0.0.1"',
     "port": "a port number, 0 to 65535",
     "pose_rate_hz": "poses a second, up to 1000",
+    "token": 'a secret in quotes, or "sha256:" and the 64 hexadecimal digits of its SHA-256',
+    "certificate": 'the path of a TLS certificate in PEM format, such as "certificate.pem"',
+    "key": 'the path of the certificate\'s private key in PEM format, such as "key.pem"',
+    "origins": 'a list of addresses of web pages, such as ["https://panel.example"]',
     "name": "a name of letters, digits, `_`, `-` and `.`, at most 64",
     "calibration": "the path of the camera's calibration file, such as example-camera.toml beside example.toml",
     "dictionary": 'the name of a marker dictionary, such as "4X4_50" or "APRILTAG_36H11"',
@@ -175,7 +189,12 @@ def parse(text: str, name: str = "configuration", folder: Path = Path()) -> Conf
     except msgspec.ValidationError as error:
         raise source.explain(str(error)) from None
     _check(config, source)
-    return msgspec.structs.replace(config, camera=tuple(_with_absolute_paths(c, folder) for c in config.camera))
+    server = config.server
+    if server.certificate:
+        certificate, key = (str((folder / file).absolute()) for file in (server.certificate, server.key))
+        server = msgspec.structs.replace(server, certificate=certificate, key=key)
+    cameras = tuple(_with_absolute_paths(camera, folder) for camera in config.camera)
+    return msgspec.structs.replace(config, server=server, camera=cameras)
 
 
 def _with_absolute_paths(camera: CameraConfig, folder: Path) -> CameraConfig:
@@ -207,6 +226,14 @@ def _check(config: Config, source: _Source) -> None:
             once("the marker id", marker.id, ("robot", i, "marker", j, "id"))
         if robot.imu.source != "websocket":
             once("the serial port", robot.imu.source, ("robot", i, "imu", "source"))
+    for given, other in (("certificate", "key"), ("key", "certificate")):
+        if getattr(config.server, given) and not getattr(config.server, other):
+            raise source.error(("server", given), f'the key "{other}" is missing: {_RIGHT[other]}')
+    for section, tokened in (("server", (config.server,)), ("robot", config.robot)):
+        for i, entry in enumerate(tokened):
+            if entry.token.startswith(HASHED) and not re.fullmatch(HASHED + "[0-9A-Fa-f]{64}", entry.token):
+                path = (section, "token") if section == "server" else (section, i, "token")
+                raise source.error(path, f"found {_shown(entry.token)}; needed: {_RIGHT['token']}")
     if not config.anchor and not all(camera.placement for camera in config.camera):
         raise source.error(
             ("camera",),
@@ -291,8 +318,18 @@ def _right(path: KeyPath) -> str:
     if names[-1:] == ["source"]:
         return _SOURCE.get(names[0], "")
     if "filter" in names[:-1]:
-        return "a number in SI units, of the range that fusion/params.py gives"
+        return _range(names[-1])
     return _RIGHT.get(names[-1], "") if names else ""
+
+
+def _range(parameter: str) -> str:
+    """What a filter parameter may be, by its type."""
+    hint = get_type_hints(FilterParams, include_extras=True).get(parameter)
+    limits = [limit for limit in getattr(hint, "__metadata__", ()) if isinstance(limit, Meta)]
+    words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+    ranges = [f"{words[k]} {getattr(limit, k):g}" for limit in limits for k in words if getattr(limit, k) is not None]
+    kind = "a whole number" if getattr(hint, "__origin__", hint) is int else "a number"
+    return " ".join([kind, " and ".join(ranges)]) + "; fusion/params.py says of what"
 
 
 def _shown(value: object) -> str:
