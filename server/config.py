@@ -229,11 +229,11 @@ def _check(config: Config, source: _Source) -> None:
     for given, other in (("certificate", "key"), ("key", "certificate")):
         if getattr(config.server, given) and not getattr(config.server, other):
             raise source.error(("server", given), f'the key "{other}" is missing: {_RIGHT[other]}')
-    for section, tokened in (("server", (config.server,)), ("robot", config.robot)):
-        for i, entry in enumerate(tokened):
-            if entry.token.startswith(HASHED) and not re.fullmatch(HASHED + "[0-9A-Fa-f]{64}", entry.token):
-                path = (section, "token") if section == "server" else (section, i, "token")
-                raise source.error(path, f"found {_shown(entry.token)}; needed: {_RIGHT['token']}")
+    tokens: list[tuple[KeyPath, str]] = [(("server", "token"), config.server.token)]
+    tokens += [(("robot", i, "token"), robot.token) for i, robot in enumerate(config.robot)]
+    for path, token in tokens:
+        if token.startswith(HASHED) and not re.fullmatch(HASHED + "[0-9A-Fa-f]{64}", token):
+            raise source.error(path, f"found {_shown(token)}; needed: {_RIGHT['token']}")
     if not config.anchor and not all(camera.placement for camera in config.camera):
         raise source.error(
             ("camera",),
