@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections import Counter
 from typing import NamedTuple
 
 
@@ -30,6 +30,36 @@ class DroppedError(ValueError):
         self.reason = reason
 
 
+class Parser:
+    """Bytes of one protocol to samples. A subclass says how, in `feed`.
+
+    `reasons` says how many lines or frames were dropped for which reason, and `last_error` the latest in words.
+    `dropped_bytes`: bytes that belong to no line or frame that could be used. `missing`: frames that the device
+    numbered and that never came. `note`: what this protocol cannot give, "" for nothing.
+    """
+
+    protocol = ""
+    note = ""
+
+    def __init__(self) -> None:
+        self.reasons: Counter[str] = Counter()
+        self.last_error = ""
+        self.dropped_bytes = 0
+        self.missing = 0
+
+    @property
+    def dropped(self) -> int:
+        return self.reasons.total()
+
+    def feed(self, data: bytes) -> list[RawSample]:
+        """The samples that `data` completes. Never raises for what a device sends."""
+        raise NotImplementedError
+
+    def _drop(self, error: DroppedError) -> None:
+        self.reasons[error.reason] += 1
+        self.last_error = str(error)
+
+
 # Beyond what any device measures (4000 deg/s are 70 rad/s, 200 g are 1960 m/s2): such a number is a broken one. A
 # clock that counts seconds from 1970 reads 2e9, one that counts nanoseconds by mistake 2e18.
 TIME_LIMIT = 1e12
@@ -37,14 +67,23 @@ RATE_LIMIT = 200.0
 FORCE_LIMIT = 4000.0
 
 
-def raw_sample(device_time: float | None, rates: Iterable[float], forces: Iterable[float]) -> RawSample:
+def raw_sample(
+    device_time: float | None, rates: tuple[float, float, float], forces: tuple[float, float, float]
+) -> RawSample:
     """A sample whose numbers are finite and possible. Raises DroppedError."""
-    sample = RawSample(device_time, *rates, *forces)
-    for value, limit in zip(
-        (device_time or 0.0, *sample[1:]), (TIME_LIMIT, *(RATE_LIMIT,) * 3, *(FORCE_LIMIT,) * 3), strict=True
+    gx, gy, gz = rates
+    ax, ay, az = forces
+    # A comparison with nan is false.
+    if (
+        -RATE_LIMIT <= gx <= RATE_LIMIT
+        and -RATE_LIMIT <= gy <= RATE_LIMIT
+        and -RATE_LIMIT <= gz <= RATE_LIMIT
+        and -FORCE_LIMIT <= ax <= FORCE_LIMIT
+        and -FORCE_LIMIT <= ay <= FORCE_LIMIT
+        and -FORCE_LIMIT <= az <= FORCE_LIMIT
+        and (device_time is None or -TIME_LIMIT <= device_time <= TIME_LIMIT)
     ):
-        if not math.isfinite(value):
-            raise DroppedError("not finite", list(sample))
-        if abs(value) > limit:
-            raise DroppedError("out of range", list(sample))
-    return sample
+        return RawSample(device_time, gx, gy, gz, ax, ay, az)
+    found = [device_time, gx, gy, gz, ax, ay, az]
+    finite = all(value is None or math.isfinite(value) for value in found)
+    raise DroppedError("out of range" if finite else "not finite", found)

@@ -23,6 +23,8 @@ _DECODER = msgspec.json.Decoder(_Reading)
 class JsonLines(LineParser):
     """See `LineParser`."""
 
+    protocol = "json"
+
     def __init__(self) -> None:
         super().__init__(_decode)
 

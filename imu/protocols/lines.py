@@ -1,56 +1,50 @@
-"""Bytes to lines, with a bound and a count: what the JSON and the CSV protocol have in common."""
+"""Bytes to lines, or to frames between delimiters, with a bound and a count."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 
-from imu.protocols import DroppedError, RawSample
+from imu.protocols import DroppedError, Parser, RawSample
 
-# The longest line of either protocol, with every number in full precision, is under 250 bytes.
-MAX_LINE = 1024
+# A sample with every number in full precision takes under 500 bytes; the header of a wide table takes more.
+MAX_LINE = 4096
 
 
-class LineParser:
+class LineParser(Parser):
     """Lines to samples by `decode`, which returns None for a line without meaning and raises DroppedError.
 
-    `dropped`: lines that held no sample (a run of bytes longer than MAX_LINE counts as one); `reasons` says how many
-    for which reason and `last_error` the latest in words. At most MAX_LINE bytes are kept between calls.
+    A run of more than MAX_LINE bytes without an `end` counts as one line. At most MAX_LINE bytes are kept between
+    calls. Empty lines are none.
     """
 
-    def __init__(self, decode: Callable[[bytes], RawSample | None]) -> None:
+    def __init__(self, decode: Callable[[bytes], RawSample | None], end: bytes = b"\n") -> None:
+        super().__init__()
         self._decode = decode
+        self._end = end
         self._partial = b""
         self._overflowing = False
-        self.reasons: Counter[str] = Counter()
-        self.last_error = ""
-
-    @property
-    def dropped(self) -> int:
-        return self.reasons.total()
 
     def feed(self, data: bytes) -> list[RawSample]:
-        """The samples of the lines that `data` completes. Never raises."""
         samples: list[RawSample] = []
-        *lines, partial = (self._partial + data).split(b"\n")
+        *lines, partial = (self._partial + data).split(self._end)
         for line in lines:
             try:
                 if self._overflowing:
                     self._overflowing = False
+                    self.dropped_bytes += len(line) + 1
                 elif len(line) > MAX_LINE:
                     raise DroppedError("too long", f"more than {MAX_LINE} bytes without an end of line")
-                elif (stripped := line.strip()) and (sample := self._decode(stripped)) is not None:
+                elif line and not line.isspace() and (sample := self._decode(line)) is not None:
                     samples.append(sample)
             except DroppedError as error:
-                self._count(error)
-        if len(partial) > MAX_LINE:
+                self._drop(error)
+                self.dropped_bytes += len(line) + 1
+        if len(partial) > MAX_LINE or self._overflowing:
             if not self._overflowing:
-                self._count(DroppedError("too long", f"more than {MAX_LINE} bytes without an end of line"))
+                self._drop(DroppedError("too long", f"more than {MAX_LINE} bytes without an end of line"))
+            # The bytes of an overlong line are not needed any more, only its end.
             self._overflowing = True
-        # The bytes of an overlong line are not needed any more, only its end.
-        self._partial = b"" if self._overflowing else partial
+            self.dropped_bytes += len(partial)
+            partial = b""
+        self._partial = partial
         return samples
-
-    def _count(self, error: DroppedError) -> None:
-        self.reasons[error.reason] += 1
-        self.last_error = str(error)

@@ -92,7 +92,7 @@ CSV_FAULTS = {
     b"1,0,0,0,0,0,9.8,1": "wrong columns",
     b"1,0,0,0,0,,9.8": "not a number",
     b"1,0,0,0,\xff,0,9.8": "not a number",
-    b"1;0;0;0;0;0;9.8": "wrong columns",
+    b"1;0;0;0;0;0;9.8": "not a number",
     b"1,0,0,201,0,0,9.8": "out of range",
 }
 

@@ -1,0 +1,115 @@
+"""Which protocol, and at which speed: by trying all parsers on what comes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Literal, get_args
+
+from imu.protocols import DroppedError, Parser, RawSample
+from imu.protocols.bno08x_rvc import Bno08xRvc
+from imu.protocols.csv_lines import CsvLines
+from imu.protocols.json_lines import JsonLines
+from imu.protocols.mavlink import Mavlink, MavlinkMissingError
+from imu.protocols.steadfix_frames import SteadfixFrames
+from imu.protocols.vectornav_ascii import VectorNavAscii
+from imu.protocols.vectornav_binary import VectorNavBinary
+from imu.protocols.witmotion import WitMotion
+
+ProtocolName = Literal[
+    "auto", "json", "csv", "steadfix", "witmotion", "bno08x-rvc", "vectornav", "vectornav-binary", "mavlink"
+]
+# bits/s, in the order in which they are tried.
+BAUD_RATES = (115200, 921600, 460800, 230400, 57600, 38400, 9600, 19200, 1_000_000, 2_000_000)
+# Samples by which a protocol is recognised, and bytes without after which the next speed is tried.
+ENOUGH = 4
+PUZZLED = 4096
+
+
+def open_parser(protocol: ProtocolName, columns: str = "", baud: int = 0) -> Parser:
+    """A parser for `protocol`; `columns` are for CSV, `baud` is where a `Detector` begins.
+
+    Raises ColumnsError and MavlinkMissingError.
+    """
+    if protocol == "auto":
+        return Detector(columns, baud)
+    return _makers(columns)[protocol]()
+
+
+def _makers(columns: str) -> dict[str, Callable[[], Parser]]:
+    return {
+        "json": JsonLines,
+        "csv": lambda: CsvLines(columns),
+        "steadfix": SteadfixFrames,
+        "witmotion": WitMotion,
+        "bno08x-rvc": Bno08xRvc,
+        "vectornav": VectorNavAscii,
+        "vectornav-binary": VectorNavBinary,
+        "mavlink": Mavlink,
+    }
+
+
+class Detector(Parser):
+    """All parsers at once, until one has given ENOUGH samples; from then on that one. Raises ColumnsError.
+
+    `baud`: the speed at which to listen, which changes while nothing is recognised: set the port to it after each
+    `feed`; 0 where there is no port. Silence changes nothing, since nothing is to be learnt from it.
+    """
+
+    def __init__(self, columns: str = "", baud: int = 0) -> None:
+        super().__init__()
+        self.baud = baud
+        self._bauds = [baud, *(other for other in BAUD_RATES if other != baud)]
+        self._makers = _makers(columns)
+        self._chosen: Parser | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._heard = b""
+        self._candidates: list[tuple[Parser, list[RawSample]]] = []
+        for make in self._makers.values():
+            with contextlib.suppress(MavlinkMissingError):
+                self._candidates.append((make(), []))
+
+    def feed(self, data: bytes) -> list[RawSample]:
+        samples = self._try(data) if self._chosen is None else self._chosen.feed(data)
+        if self._chosen is not None:
+            self.last_error, self.missing = self._chosen.last_error, self._chosen.missing
+            self.dropped_bytes = self._chosen.dropped_bytes
+        return samples
+
+    def _try(self, data: bytes) -> list[RawSample]:
+        for parser, samples in self._candidates:
+            samples += parser.feed(data)
+            if len(samples) >= ENOUGH:
+                self._chosen = parser
+                self.protocol, self.note, self.reasons = parser.protocol, parser.note, parser.reasons
+                return samples
+        self._heard += data[:PUZZLED]
+        self.dropped_bytes += len(data)
+        if len(self._heard) >= PUZZLED:
+            self._drop(
+                DroppedError("not recognised", describe(self._heard) + (f" (at {self.baud} baud)" if self.baud else ""))
+            )
+            if self.baud:
+                self.baud = self._bauds[(self._bauds.index(self.baud) + 1) % len(self._bauds)]
+            self._begin()
+        return []
+
+
+def describe(data: bytes) -> str:
+    """In words, what bytes look like that no parser understands."""
+    printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) / max(1, len(data))
+    if printable > 0.95 and b"\n" in data:
+        lines = [line.strip() for line in data.split(b"\n")[1:-1] if line.strip()]
+        line = lines[len(lines) // 2] if lines else data.strip()
+        what = f"text of no known form, such as {line[:80].decode(errors='replace')!r}"
+        if line.count(b",") >= 5:
+            what += '; its columns have to be named, such as "t[us],gx[deg/s],gy[deg/s],gz[deg/s],ax[g],ay[g],az[g]"'
+        return what
+    if data.count(data[:1]) == len(data):
+        return f"nothing but the byte {data[0]:#04x}: a wrong baud rate, or a line that hangs" if data else "nothing"
+    return f"neither text nor known frames, but {data[:12].hex(' ')} ...: a wrong baud rate, or an unknown protocol"
+
+
+assert set(get_args(ProtocolName)) == {"auto", *_makers("")}
