@@ -76,6 +76,12 @@ class Health:
             self._end += n
         self._last_fix = self.localiser.last_fix
 
+    def another_imu(self) -> None:
+        """The device has connected anew, or it is another one: what the last one sent is no measure for it."""
+        self._chunks.clear()
+        self._digested = self._end
+        self._t_before = math.nan
+
     def arrived(self, fix: PoseFix) -> None:
         """A fix that is about to be fed."""
         if fix.t < self._newest:
@@ -150,7 +156,8 @@ class Health:
         self._digested += count * BLOCK
         t = rows[:, _T]
         if math.isnan(self._t_before):
-            self._began = self._t_before = float(t[0])
+            self._t_before = float(t[0])
+            self._began = self._t_before if math.isnan(self._began) else self._began
             t = t[1:]
         steps = np.diff(t, prepend=self._t_before)
         self._t_before = float(t[-1])
