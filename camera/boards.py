@@ -33,6 +33,8 @@ _SEARCH_PX = 1280
 # Half of the window in which a corner is measured, as part of the distance to the next corner. With much more the next
 # corner comes in where perspective is strong.
 _WINDOW = 0.3
+# Views are the same where corners moved by less than this part of the picture's diagonal, on average.
+_SAME = 0.005
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
@@ -135,6 +137,15 @@ class BoardView:
     width_px: int
     height_px: int
 
+    def same_as(self, other: BoardView) -> bool:
+        """Whether the board is where it is in the other view, as nearly as makes no difference: such a view would
+        count for nothing new."""
+        common, mine, theirs = np.intersect1d(self.indices, other.indices, return_indices=True)
+        if 2 * len(common) < max(len(self.indices), len(other.indices)):
+            return False
+        moved = np.linalg.norm(self.corners_px[mine] - other.corners_px[theirs], axis=1).mean()
+        return bool(moved < _SAME * math.hypot(self.width_px, self.height_px))
+
 
 class BoardDetector:
     """Finds one board. OpenCV's detectors write into themselves: one BoardDetector per thread."""
@@ -177,7 +188,8 @@ class BoardDetector:
         found, _, grid = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
         size = sorted(grid.shape[:2], reverse=True) if found else []
         if size and size != sorted((self.board.columns, self.board.rows), reverse=True):
-            return f"it shows {size[0]} x {size[1]} inner corners"
+            square = 1e3 * self.board.square
+            return f"it shows {size[0]} x {size[1]} inner corners; is it --board chessboard:{size[0]}x{size[1]}:{square:g}mm?"
         return "no chessboard is seen"
 
     def _chessboard(self, picture: Image, thorough: bool) -> tuple[NDArray[np.integer], Array] | None:

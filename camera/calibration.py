@@ -13,6 +13,7 @@ The file is TOML:
 from __future__ import annotations
 
 import datetime
+import json
 import math
 import os
 from collections.abc import Collection, Sequence
@@ -136,8 +137,22 @@ def save_intrinsics(path: str | os.PathLike[str], intrinsics: Intrinsics, qualit
     if intrinsics.rms_px is not None:
         lines.append(f"rms_px = {intrinsics.rms_px!r}")
     if quality is not None:
-        lines += ["", "[quality]", msgspec.toml.encode(quality).decode().rstrip()]
+        lines += ["", "[quality]"]
+        lines += [f"{key} = {_toml(value)}" for key, value in msgspec.structs.asdict(quality).items()]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _toml(value: object) -> str:
+    match value:
+        case bool():
+            return str(value).lower()
+        case str():
+            return json.dumps(value)
+        case datetime.date():
+            return value.isoformat()
+        case tuple():
+            return repr(list(value))
+    return repr(value)
 
 
 # What a calibration is accepted on. RMS alone is a bad judge: a few frontal views fit perfectly and say nothing.

@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 COMMANDS = {
     "run": ("server.run", "the service: cameras and IMUs in, poses out; without a configuration a simulated room"),
     "replay": ("server.replay", "run a recording through the filter again"),
+    "calibrate": ("server.calibrate", "a camera's focal length and distortion, from pictures of a board"),
     "detect": ("server.detect", "find markers in images"),
 }
 # Exit status: 1 for what the machine refused, 2 for what the user can put right, as argparse has it.
