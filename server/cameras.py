@@ -10,12 +10,13 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
+from camera.exposure import Delivery, DeliveryMeter, advice, black
 from camera.fix import MarkerMount, marker_poses, rays, solve
 from camera.floor import Anchor, Placement, PlacementError, load_placement, locate_camera
 from camera.markers import MarkerDetector, MarkerSighting
@@ -47,10 +48,33 @@ class Seen:
     tracker: tuple[bytes, ...]
 
 
-Open = Callable[[CameraConfig], FrameSource]
+@dataclass(frozen=True, slots=True)
+class SightedFrame:
+    """A frame that was looked at elsewhere: its stamp (s, host monotonic), its size and what was seen in it.
+
+    `detect_ms`: how long that took.
+    """
+
+    t: float
+    sequence: int
+    width_px: int
+    height_px: int
+    sightings: list[MarkerSighting]
+    detect_ms: float
+
+
+class Source(Protocol):
+    """A FrameSource, or one whose frames were looked at elsewhere."""
+
+    def read(self, timeout: float) -> Frame | SightedFrame | None: ...
+    def close(self) -> None: ...
+
+
+Open = Callable[[CameraConfig], Source]
 
 
 def open_configured(config: CameraConfig) -> FrameSource:
+    """The source that the configuration names."""
     return open_source(
         config.source,
         width_px=config.width_px,
@@ -105,17 +129,19 @@ class Camera:
                 )
             self.placement, self.unlocated = load_placement(config.placement), ""
         self._anchors = [_anchor(anchor) for anchor in room.anchor]
-        self._anchor_ids = {anchor.id for anchor in room.anchor}
+        self.anchor_ids = {anchor.id for anchor in room.anchor}
         self._robots = [
             (robot.name, [_mount(marker) for marker in robot.marker], robot.motion != "free") for robot in room.robot
         ]
         self._sizes = {marker.id: marker.size for marker in self._anchors}
         self._sizes |= {mount.id: mount.size for _, mounts, _ in self._robots for mount in mounts}
+        self.ids = frozenset(self._sizes)
         try:
-            self._detector = MarkerDetector(config.dictionary, ids=self._sizes.keys())
+            self._detector = MarkerDetector(config.dictionary, ids=self.ids)
         except ValueError as error:
             raise ConfigError(f'camera "{config.name}": {error}') from None
         self._image_size = (0, 0)
+        self._meter = DeliveryMeter()
         # Anchors as seen in the frames of the present look; whether one whole look has been had; whether the last one
         # found the camera elsewhere.
         self._looks: list[list[MarkerSighting]] = []
@@ -123,7 +149,7 @@ class Camera:
         self._settled = self.placement is not None
         self._moved = False
         self._arrivals: deque[float] = deque()
-        self._source: FrameSource | None = None
+        self._source: Source | None = None
         self._stop = threading.Event()
         # A daemon: a driver that hangs must not keep the service from ending.
         self._thread = threading.Thread(target=self._run, name=f"camera {config.name}", daemon=True)
@@ -186,14 +212,16 @@ class Camera:
             source.close()
         return True
 
-    def _see(self, frame: Frame) -> Seen:
+    def _see(self, frame: Frame | SightedFrame) -> Seen:
         arrival = time.monotonic()
-        t = frame.t + self.config.time_offset
-        height_px, width_px = frame.image.shape[:2]
-        self.intrinsics.check_size(width_px, height_px)
-        self._image_size = (width_px, height_px)
-        sightings = self._detector.detect(frame.image, t, self.config.name)
-        self.detect_ms = (time.monotonic() - arrival) * 1e3
+        if isinstance(frame, SightedFrame):
+            self._take_size(frame.width_px, frame.height_px)
+            sightings, self.detect_ms = frame.sightings, frame.detect_ms
+        else:
+            self._take_size(frame.image.shape[1], frame.image.shape[0])
+            self._meter.add(frame, arrival)
+            sightings = self._detector.detect(frame.image, frame.t + self.config.time_offset, self.config.name)
+            self.detect_ms = (time.monotonic() - arrival) * 1e3
         self.frames += 1
         self.last_frame = arrival
         self.markers = tuple(sorted(sighting.id for sighting in sightings))
@@ -201,17 +229,21 @@ class Camera:
         while self._arrivals[0] < arrival - RATE_WINDOW:
             self._arrivals.popleft()
         if arrival >= self._next_look:
-            self._look([sighting for sighting in sightings if sighting.id in self._anchor_ids], arrival)
+            self._look([sighting for sighting in sightings if sighting.id in self.anchor_ids], arrival)
         return Seen(
             fixes=tuple(self._fixes(sightings, arrival)),
             tracker=tuple(self._tracker(sightings)) if self._tracker_wanted() else (),
         )
 
+    def _take_size(self, width_px: int, height_px: int) -> None:
+        self.intrinsics.check_size(width_px, height_px)
+        self._image_size = (width_px, height_px)
+
     def _look(self, anchors: list[MarkerSighting], now: float) -> None:
         """Find the camera from its anchors: at once, better with each of the first frames; then keep it and check."""
         if not anchors:
             if self.placement is None:
-                self.unlocated = f"no anchor is in view; looking for {_listed(self._anchor_ids)}"
+                self.unlocated = f"no anchor is in view; looking for {_listed(self.anchor_ids)}"
             return
         self._looks.append(anchors)
         whole = len(self._looks) >= PLACEMENT_FRAMES
@@ -271,10 +303,28 @@ class Camera:
         recent = [t for t in list(self._arrivals) if t >= now - RATE_WINDOW]
         return 0.0 if len(recent) < 2 else (len(recent) - 1) / (recent[-1] - recent[0])
 
+    def delivery(self, now: float) -> Delivery | None:
+        """What its source delivers, None where that is not known."""
+        return self._meter.delivery(now)
+
+    def advice(self, now: float) -> list[str]:
+        """What would make its picture better, in words."""
+        delivery = self.delivery(now)
+        if delivery is None:
+            return []
+        return advice(
+            delivery,
+            focal_px=float(self.intrinsics.camera_matrix[0, 0]),
+            distance=None if self.placement is None else float(self.placement.world_from_camera[2, 3]),
+            asked_rate_hz=self.config.frame_rate_hz,
+        )
+
     def health(self, now: float) -> dict[str, Any]:
         placement = self.placement
+        delivery = self.delivery(now)
         return {
-            "status": self.status or "ok",
+            "status": self.status or (black(delivery) if delivery is not None else "") or "ok",
+            "advice": self.advice(now),
             "frame_rate_hz": round(self.frame_rate_hz(now), 1),
             "frame_age": round(now - self.last_frame, 3) if math.isfinite(self.last_frame) else None,
             "frames": self.frames,

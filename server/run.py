@@ -5,10 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import logging
-import os
-import signal
-import sys
 from pathlib import Path
 
 import cv2
@@ -18,6 +14,7 @@ from server.app import SERVICE, Service
 from server.config import Config, load
 from server.demo.room import DemoRoom
 from server.recording import Recorder
+from server.terminal import log_to_stderr, stop_signals
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,22 +36,14 @@ def _port(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    # A descriptor of its own: `camera.capture` silences the process's standard error now and then, for C libraries.
-    stream = os.fdopen(os.dup(sys.stderr.fileno()), "w", buffering=1, errors="backslashreplace")
-    logging.basicConfig(format="%(asctime)s  %(message)s", datefmt="%H:%M:%S", level=logging.INFO, stream=stream)
-    # Its INFO is one line for each connection.
-    logging.getLogger("websockets").setLevel(logging.ERROR)
+    log_to_stderr()
     # One thread for each camera is what keeps several of them fast.
     cv2.setNumThreads(1)
     return asyncio.run(_run(args))
 
 
 async def _run(args: argparse.Namespace) -> int:
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # Not the loop's own way, which loses a signal while the loop is too busy to read what threads tell it.
-        signal.signal(number, lambda *_: _set(loop, stop))
+    stop = stop_signals()
     if args.config is not None:
         await _serve_until(stop, load(args.config), args)
         return 0
@@ -65,12 +54,6 @@ async def _run(args: argparse.Namespace) -> int:
         room.stop()
     print(room.report(), flush=True)
     return 0
-
-
-def _set(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
-    # A second Ctrl-C may come when the loop is closed already.
-    with contextlib.suppress(RuntimeError):
-        loop.call_soon_threadsafe(stop.set)
 
 
 async def _serve_until(
