@@ -1,6 +1,7 @@
 """The service: one asyncio loop, one port, cameras and serial lines on threads of their own.
 
-Paths: WebSocket `/` (the original tracker's stream), `/v1/poses`, `/v1/robot`; GET `/` (a page), `/healthz`.
+Paths: WebSocket `/` (the original tracker's stream), `/v1/poses`, `/v1/robot`; GET `/` and `/phone` (pages),
+`/healthz`. Who may use them is in `server.access`.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Callable, Collection, Coroutine
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from email.utils import formatdate
 from importlib.metadata import version
 from importlib.resources import files
 from types import TracebackType
-from typing import Any, Self, get_args
+from typing import Any, Self, TypeVar, get_args
 from urllib.parse import parse_qsl, urlsplit
 
 import msgspec
@@ -41,20 +42,24 @@ from imu.protocols.csv_lines import CsvLines
 from imu.protocols.json_lines import JsonLines
 from imu.protocols.lines import LineParser
 from imu.uart import SerialImu
+from server.access import bearer, is_local, is_loopback, origin_allowed, tls, token_matches
+from server.camera_messages import camera_hello
 from server.cameras import FIRST_PAUSE, LONGEST_PAUSE, Camera, Open, Seen, open_configured
-from server.config import Config
-from server.hub import STALL_LIMIT, Hub
+from server.config import CameraConfig, Config
+from server.hub import STALL_LIMIT, Hub, Subscription
 from server.messages import (
+    FORMATS,
     ClockAnswer,
     ClockQuestion,
+    Dialect,
     Error,
     Hello,
     Imu,
     MessageError,
+    Notice,
+    Watch,
     Welcome,
-    decode,
-    encode,
-    raw_samples,
+    decode_watch,
 )
 from server.robots import Recording, Robot
 
@@ -63,6 +68,15 @@ log = logging.getLogger("steadfix")
 SERVICE = f"steadfix {version('steadfix')}"
 # A batch of 200 samples in full precision is 30 KiB.
 MAX_MESSAGE = 64 * 1024
+# Bytes a second that a connection may send, each message counting for so many more, and the seconds that it may have
+# been silent to send more at once. An IMU of 1 kHz that sends each sample alone needs a third.
+BYTES_PER_SECOND = 2_000_000
+MESSAGE_COST = 500
+SAVED_UP = 5.0
+# Connections at a time.
+MAX_CONNECTIONS = 500
+# s before one who showed a wrong token is told, so that nobody can try many.
+WRONG_TOKEN_PAUSE = 1.0
 # Bytes of the original stream that may wait for a client: there each message counts, so some may.
 TRACKER_ROOM = 64 * 1024
 # s without a word after which a robot's connection is taken for dead, and another may take its place.
@@ -81,14 +95,18 @@ _PAGE = {
     "/dashboard.css": ("dashboard.css", "text/css; charset=utf-8"),
     "/dashboard.js": ("dashboard.js", "text/javascript; charset=utf-8"),
     "/favicon.svg": ("favicon.svg", "image/svg+xml"),
+    "/phone": ("phone.html", "text/html; charset=utf-8"),
+    "/phone.js": ("phone.js", "text/javascript; charset=utf-8"),
 }
-_WEBSOCKETS = ("/", "/v1/poses", "/v1/robot")
+_WEBSOCKETS = ("/", "/v1/poses", "/v1/robot", "/v1/camera")
 _THERE_IS = (
     "There is:\n"
     "  GET        /           the page that shows the robots\n"
+    "  GET        /phone      the page that makes a phone an IMU\n"
     "  GET        /healthz    health, as JSON\n"
-    "  WebSocket  /v1/poses   poses; ?robots=a,b&rate=50&channel=best\n"
+    "  WebSocket  /v1/poses   poses; ?robots=a,b&rate=50&channel=best&format=msgpack\n"
     "  WebSocket  /v1/robot   for a robot: IMU up, its pose down\n"
+    "  WebSocket  /v1/camera  for the node of a remote camera, `steadfix camera`\n"
     "  WebSocket  /           marker sightings, as the original tracker sent them\n"
 )
 _MODES = {
@@ -101,28 +119,60 @@ _MODES = {
 }
 
 
+T = TypeVar("T")
+
+
 class RefusedError(Exception):
-    """A client that cannot be served. The text is what it is told before its connection is closed."""
+    """A client that cannot be served. The text is what it is told before its connection is closed.
+
+    `retry`: whether the same may work later.
+    """
+
+    def __init__(self, reason: str, retry: bool = False) -> None:
+        super().__init__(reason)
+        self.retry = retry
 
 
-@dataclass(eq=False)
 class _Visitor:
-    """One connection: what it was refused, for the log and the health."""
+    """One connection: who it is, how it speaks, what it may still send, and what it was refused."""
 
-    connection: ServerConnection
-    name: str
-    refused: int = 0
+    def __init__(self, connection: ServerConnection, path: str) -> None:
+        assert connection.request is not None
+        self.connection = connection
+        self.name = f"{path} from {_address(connection)}"
+        self.headers = _lower(connection.request.headers)
+        self.local = is_local(_host(connection), self.headers)
+        self.dialect = Dialect()
+        self.refused = 0
+        self._credit = BYTES_PER_SECOND * SAVED_UP
+        self._credited = time.monotonic()
 
-    @classmethod
-    def of(cls, connection: ServerConnection, path: str) -> _Visitor:
-        return cls(connection, f"{path} from {_address(connection)}")
+    async def receive(self) -> str | bytes:
+        """Its next message. One that sends too much is not read for a while. Raises ConnectionClosed."""
+        if self._credit < 0.0:
+            log.warning("%s sends more than %.0f kB a second and is made to wait", self.name, BYTES_PER_SECOND / 1e3)
+            await asyncio.sleep(SAVED_UP - self._credit / BYTES_PER_SECOND)
+        data = await self.connection.recv()
+        now = time.monotonic()
+        earned = (now - self._credited) * BYTES_PER_SECOND
+        self._credit = min(self._credit + earned, BYTES_PER_SECOND * SAVED_UP) - len(data) - MESSAGE_COST
+        self._credited = now
+        return data
+
+    async def tell(self, message: msgspec.Struct) -> None:
+        """Waits until the client takes it."""
+        await self.connection.send(self.dialect.encode(message), text=not self.dialect.binary)
+
+    def tell_now(self, message: msgspec.Struct) -> None:
+        """Into its buffer."""
+        broadcast([self.connection], self.dialect.encode(message), text=not self.dialect.binary)
 
 
 @dataclass(eq=False)
 class _Link:
     """A robot's connection. `questions`: clock questions on the way, id -> when they were sent."""
 
-    connection: ServerConnection
+    visitor: _Visitor
     heard: float
     questions: dict[int, float] = field(default_factory=dict)
 
@@ -144,10 +194,7 @@ class Service:
         self.config = config
         self.hub = Hub()
         self.robots = {robot.name: Robot(robot, recording) for robot in config.robot}
-        self.cameras = {
-            camera.name: Camera(camera, config, self._deliver, lambda: self.hub.wants("tracker"), open_camera)
-            for camera in config.camera
-        }
+        self.cameras = {camera.name: self._camera(camera, open_camera) for camera in config.camera}
         self.refused = 0
         self.port = 0
         # Set once the filters' kernels are compiled; what comes before is not fed.
@@ -172,6 +219,7 @@ class Service:
                 host,
                 port,
                 process_request=self._answer,
+                ssl=tls(self.config.server.certificate, self.config.server.key),
                 compression=None,
                 max_size=MAX_MESSAGE,
                 close_timeout=CLOSE_TIMEOUT,
@@ -180,8 +228,8 @@ class Service:
         except OSError as error:
             raise _words(error, host, port) from None
         self.port = self._server.sockets[0].getsockname()[1]
-        if host not in ("127.0.0.1", "localhost", "::1"):
-            log.warning("listening on %s: anyone on this network can see the robots and speak for them", host)
+        if not is_loopback(host):
+            self._say_who_is_let_in(host)
         for camera in self.cameras.values():
             camera.start()
         self._spawn(self._warm_up())
@@ -204,6 +252,24 @@ class Service:
             self._server.close(code=CloseCode.GOING_AWAY, reason="the service is ending")
             await self._server.wait_closed()
         await asyncio.gather(*(asyncio.to_thread(camera.join, CLOSE_TIMEOUT) for camera in self.cameras.values()))
+
+    def _camera(self, config: CameraConfig, open_camera: Open) -> Camera:
+        def wanted() -> bool:
+            return self.hub.wants("tracker")
+
+        if config.source == "remote":
+            return RemoteCamera(config, self.config, self._deliver, wanted)
+        return Camera(config, self.config, self._deliver, wanted, open_camera)
+
+    def _say_who_is_let_in(self, host: str) -> None:
+        server = self.config.server
+        tokenless = [robot.name for robot in self.config.robot if not robot.token and robot.imu.source == "websocket"]
+        if not server.token:
+            log.warning("listening on %s, but [server] has no token: poses and health for this machine only", host)
+        if tokenless:
+            log.warning("without a token, taken from this machine only: %s", ", ".join(tokenless))
+        if not server.certificate and (server.token or len(tokenless) < len(self.config.robot)):
+            log.warning("without a certificate under [server], tokens can be read by others on the network")
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run in the background; if it fails, which nothing here should, the service fails instead of limping on."""
@@ -325,19 +391,10 @@ class Service:
         due = time.monotonic()
         while True:
             now = time.monotonic()
+            wanted = self.hub.due(now)
             messages: dict[str, bytes] = {}
             for name, robot in self.robots.items():
-                pose = robot.publish(now)
-                if pose is None:
-                    continue
-                if self._published is not None:
-                    self._published(pose)
-                if self.hub.wants(f"smooth/{name}"):
-                    messages[f"smooth/{name}"] = robot.encode(pose, now)
-                if self.hub.wants(f"best/{name}") and (best := robot.localiser.pose_at(now)) is not None:
-                    messages[f"best/{name}"] = robot.encode(best, now)
-                if self.hub.wants(f"own/{name}"):
-                    messages[f"own/{name}"] = robot.encode_own(pose, now)
+                messages |= self._pose_messages(name, robot, now, wanted)
             self.hub.publish(now, messages)
             for _ in self.hub.sweep(now):
                 log.warning("a client took nothing for %.0f s and was cut off", STALL_LIMIT)
@@ -345,13 +402,48 @@ class Service:
             due = max(due + period, now)
             await asyncio.sleep(due - time.monotonic())
 
+    def _pose_messages(self, name: str, robot: Robot, now: float, wanted: set[str]) -> dict[str, bytes]:
+        own = f"own/{name}"
+        viewed = {
+            channel: formats
+            for channel in get_args(Channel)
+            if (formats := [format for format in FORMATS if f"{channel}/{name}/{format}" in wanted])
+        }
+        if not viewed and own not in wanted and self._published is None:
+            return {}
+        pose = self._pose(robot, now)
+        if pose is None:
+            return {}
+        messages = {}
+        if own in wanted:
+            link = self._links.get(name)
+            messages[own] = robot.encode_own(pose, now, link.visitor.dialect if link is not None else Dialect())
+        for channel, formats in viewed.items():
+            shown = pose if channel == "smooth" else robot.localiser.pose_at(now, channel)
+            if shown is not None:
+                message = robot.message(shown, now)
+                messages |= {f"{channel}/{name}/{format}": FORMATS[format](message) for format in formats}
+        return messages
+
+    def _pose(self, robot: Robot, now: float) -> Pose | None:
+        pose = robot.publish(now)
+        if pose is not None and self._published is not None:
+            self._published(pose)
+        return pose
+
     async def _diagnose(self) -> None:
         await self.ready.wait()
         while True:
             await asyncio.sleep(DIAGNOSE_EVERY)
             for name, robot in self.robots.items():
                 for text in robot.diagnose(time.monotonic()):
-                    log.info("robot %s: %s", name, text)
+                    self._note(name, text)
+
+    def _note(self, name: str, text: str) -> None:
+        """Say what looks wrong with a robot's data: in the log, and to the robot."""
+        log.info("robot %s: %s", name, text)
+        if (link := self._links.get(name)) is not None:
+            link.visitor.tell_now(Notice(text))
 
     def health(self) -> dict[str, Any]:
         now = time.monotonic()
@@ -399,11 +491,17 @@ class Service:
             path = urlsplit(request.path).path
         except ValueError:
             return _text(400, f"This is no path: {request.path}\n{_THERE_IS}", request)
-        if request.headers.get("Upgrade", "").lower() == "websocket":
-            return None if path in _WEBSOCKETS else _text(404, f"No WebSocket at {path}\n{_THERE_IS}", request)
+        headers = _lower(request.headers)
+        local = is_local(_host(connection), headers)
+        if headers.get("upgrade", "").lower() == "websocket":
+            if path not in _WEBSOCKETS:
+                return _text(404, f"No WebSocket at {path}\n{_THERE_IS}", request)
+            return self._door(path, headers, local, request)
         if request.method not in ("GET", "HEAD"):
             return _text(405, f"{request.method} is not possible here.\n{_THERE_IS}", request)
         if path == "/healthz":
+            if not local and not self._is_viewer(bearer(headers)):
+                return _text(401, f"{self._viewers_need()}\n", request)
             return _response(200, msgspec.json.encode(self.health()) + b"\n", "application/json", request)
         if path in self._page:
             return _response(200, *self._page[path], request)
@@ -411,26 +509,54 @@ class Service:
             return _text(426, f"{path} is a WebSocket.\n{_THERE_IS}", request)
         return _text(404, f"Nothing at {path}\n{_THERE_IS}", request)
 
+    def _door(self, path: str, headers: Mapping[str, str], local: bool, request: Request) -> Response | None:
+        """What keeps a WebSocket out before it has said anything; None lets it in."""
+        assert self._server is not None
+        if len(self._server.connections) >= MAX_CONNECTIONS:
+            return _text(503, f"{MAX_CONNECTIONS} connections are open, and no more are taken.\n", request)
+        if path == "/":
+            # As open as the original was, unless those who look on need a token.
+            if self.config.server.token and not local and not self._is_viewer(bearer(headers)):
+                return _text(401, f"{self._viewers_need()}\n", request)
+        elif not origin_allowed(headers, local, self.config.server.origins):
+            origin = headers["origin"]
+            log.warning("%s: a page of %s was kept out; `origins` under [server] lets it in", path, _for_log(origin))
+            return _text(
+                403, f"Pages of {origin} are not let in; needed: `origins` under [server] names it.\n", request
+            )
+        return None
+
+    def _is_viewer(self, token: str) -> bool:
+        return bool(self.config.server.token) and token_matches(token, self.config.server.token)
+
+    def _viewers_need(self) -> str:
+        if not self.config.server.token:
+            return "[server] has no token in the configuration, and without one only this machine is served"
+        return "This needs the token of [server] in the configuration, as `Authorization: Bearer <token>`"
+
     # WebSockets
 
     async def _serve(self, connection: ServerConnection) -> None:
         assert connection.request is not None
         url = urlsplit(connection.request.path)
-        visitor = _Visitor.of(connection, url.path)
+        visitor = _Visitor(connection, url.path)
         try:
             if url.path == "/v1/robot":
                 await self._serve_robot(visitor)
+            elif url.path == "/v1/camera":
+                await self._serve_camera(visitor)
             elif url.path == "/v1/poses":
                 await self._serve_poses(visitor, url.query)
             else:
                 await self._serve_tracker(visitor)
         except RefusedError as error:
             self.refused += 1
-            log.warning("%s was refused: %s", visitor.name, _for_log(error))
+            log.warning("%s was refused: %s", visitor.name, _for_log(str(error)))
             with contextlib.suppress(ConnectionClosed):
-                await connection.send(encode(Error(str(error))), text=True)
+                await visitor.tell(Error(str(error), error.retry))
                 # A close frame holds 123 bytes of reason.
-                await connection.close(CloseCode.POLICY_VIOLATION, str(error).encode()[:120].decode(errors="ignore"))
+                code = CloseCode.TRY_AGAIN_LATER if error.retry else CloseCode.POLICY_VIOLATION
+                await connection.close(code, str(error).encode()[:120].decode(errors="ignore"))
         except ConnectionClosed as error:
             if error.sent is not None and error.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.refused += 1
@@ -444,22 +570,46 @@ class Service:
         self.refused += 1
         visitor.refused += 1
         if visitor.refused == 1:
-            log.warning("%s sent a message that cannot be used: %s", visitor.name, _for_log(error))
-        await visitor.connection.send(encode(Error(str(error))), text=True)
+            log.warning("%s sent a message that cannot be used: %s", visitor.name, _for_log(str(error)))
+        await visitor.tell(Error(str(error)))
+
+    async def _admit(self, visitor: _Visitor, token: str, configured: str, whose: str) -> None:
+        """Let in who shows the configured token, and from this machine, where none is configured, anybody."""
+        if not configured:
+            if visitor.local:
+                return
+            raise RefusedError(
+                f"{whose} has no token in the configuration, and without one only this machine is served"
+            )
+        if not token:
+            raise RefusedError(f'{whose} needs its token: "token" in the hello, or `Authorization: Bearer <token>`')
+        if not token_matches(token, configured):
+            await asyncio.sleep(WRONG_TOKEN_PAUSE)
+            raise RefusedError(f"this is not the token of {whose}")
 
     async def _serve_tracker(self, visitor: _Visitor) -> None:
-        with self._client(visitor.connection, ["tracker"], room=TRACKER_ROOM):
-            async for _ in visitor.connection:
-                pass  # the original ignored what its clients sent
+        with self._client(visitor, ["tracker"], room=TRACKER_ROOM):
+            while True:
+                await visitor.receive()  # the original ignored what its clients sent
 
     async def _serve_poses(self, visitor: _Visitor, query: str) -> None:
-        robots, rate_hz, channel = self._poses_query(query)
-        with self._client(visitor.connection, [f"{channel}/{robot}" for robot in robots], rate_hz):
-            async for _ in visitor.connection:
+        token = bearer(visitor.headers)
+        if not visitor.local:
+            if not token and self.config.server.token:
+                token = (await self._hello(visitor, decode_watch, Watch)).token
+            await self._admit(visitor, token, self.config.server.token, "[server]")
+        robots, rate_hz, channel, format = self._poses_query(query)
+        visitor.dialect = Dialect(binary=format == "msgpack")
+        with self._client(visitor, [f"{channel}/{robot}/{format}" for robot in robots], rate_hz):
+            while True:
+                data = await visitor.receive()
+                with contextlib.suppress(MessageError):
+                    decode_watch(data)  # a page says its token wherever it is
+                    continue
                 await self._refuse(visitor, MessageError("/v1/poses only sends; robots speak on /v1/robot"))
 
-    def _poses_query(self, query: str) -> tuple[list[str], float, str]:
-        robots, rate_hz, channel = list(self.robots), self.config.server.pose_rate_hz, "smooth"
+    def _poses_query(self, query: str) -> tuple[list[str], float, str, str]:
+        robots, rate_hz, channel, format = list(self.robots), self.config.server.pose_rate_hz, "smooth", "json"
         for key, value in parse_qsl(query, keep_blank_values=True):
             if key == "robots":
                 robots = [name for name in value.split(",") if name]
@@ -476,9 +626,14 @@ class Service:
                 channel = value
                 if channel not in get_args(Channel):
                     raise RefusedError(f"channel={value}: there are {' and '.join(get_args(Channel))}")
+            elif key == "format":
+                format = value
+                if format not in FORMATS:
+                    raise RefusedError(f"format={value}: there are {' and '.join(FORMATS)}")
             else:
-                raise RefusedError(f"{key}={value} is not known here; robots=a,b, rate=50 and channel=best are")
-        return robots, rate_hz, channel
+                known = "robots=a,b, rate=50, channel=best and format=msgpack"
+                raise RefusedError(f"{key}={value} is not known here; {known} are")
+        return robots, rate_hz, channel, format
 
     def _known(self, name: str) -> Robot:
         if name not in self.robots:
@@ -487,14 +642,15 @@ class Service:
         return self.robots[name]
 
     def _client(
-        self, connection: ServerConnection, topics: Collection[str], rate_hz: float = 0.0, room: int = 0
-    ) -> AbstractContextManager[None]:
+        self, visitor: _Visitor, topics: Collection[str], rate_hz: float = 0.0, room: int = 0
+    ) -> AbstractContextManager[Subscription]:
+        connection, text = visitor.connection, not visitor.dialect.binary
         transport = connection.transport
         if (sock := transport.get_extra_info("socket")) is not None and hasattr(socket, "TCP_NOTSENT_LOWAT"):
             # What a slow client has not taken then waits here, where the newer replaces it, and not in the kernel.
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 16 * 1024)
         return self.hub.subscribed(
-            lambda data: broadcast([connection], data, text=True),
+            lambda data: broadcast([connection], data, text=text),
             transport.get_write_buffer_size,
             transport.abort,
             topics,
@@ -503,33 +659,34 @@ class Service:
         )
 
     async def _serve_robot(self, visitor: _Visitor) -> None:
-        connection = visitor.connection
-        try:
-            async with asyncio.timeout(HELLO_TIMEOUT):
-                hello = await self._hello(visitor)
-        except TimeoutError:
-            # It may not even read: no last word for it.
-            log.warning("%s has not said hello for %.0f s and was closed", visitor.name, HELLO_TIMEOUT)
-            connection.transport.abort()
-            return
+        hello = await self._hello(visitor, Dialect().decode, Hello)
+        visitor.dialect = Dialect(hello, visitor.dialect.binary)
+        robot = self.robots.get(hello.robot)
+        if robot is None and not visitor.local:
+            raise RefusedError("there is no such robot, or this is not its token")
         robot = self._known(hello.robot)
+        token = hello.token or bearer(visitor.headers)
+        await self._admit(visitor, token, robot.config.token, f'robot "{hello.robot}"')
         if robot.config.imu.source != "websocket":
             raise RefusedError(f'the IMU of "{hello.robot}" is on {robot.config.imu.source}, by the configuration')
-        link = self._take(robot, connection)
+        link = self._take(robot, visitor)
         rate_hz = min(hello.pose_rate_hz, self.config.server.pose_rate_hz)
-        await connection.send(encode(Welcome(hello.robot, SERVICE, rate_hz)), text=True)
+        await visitor.tell(Welcome(hello.robot, SERVICE, rate_hz))
         log.info("robot %s has connected", hello.robot)
         topics = [f"own/{hello.robot}"] if rate_hz > 0.0 else []
         clock = asyncio.create_task(self._ask_clock(link))
         try:
-            with self._client(connection, topics, rate_hz):
-                async for data in connection:
+            with self._client(visitor, topics, rate_hz) as subscription:
+                while True:
+                    data = await visitor.receive()
                     arrival = link.heard = time.monotonic()
                     try:
                         self._hear(robot, link, data, arrival)
                     except MessageError as error:
                         robot.dropped += 1
                         await self._refuse(visitor, error)
+                    else:
+                        self._answer_robot(robot, link, subscription)
         finally:
             clock.cancel()
             if self._links.get(hello.robot) is link:
@@ -538,62 +695,95 @@ class Service:
                 if self._server is not None and self._server.is_serving():
                     log.info("robot %s has gone", hello.robot)
 
-    async def _hello(self, visitor: _Visitor) -> Hello:
-        async for data in visitor.connection:
-            try:
-                message = decode(data)
-                if isinstance(message, Hello):
-                    return message
-                raise MessageError('the first message must be {"type":"hello","robot":"<name>"}')
-            except MessageError as error:
-                await self._refuse(visitor, error)
-        raise RefusedError("it left without a hello")
+    async def _hello(self, visitor: _Visitor, decode: Callable[[str | bytes], Any], kind: type[T]) -> T:
+        """The first message, which says who it is; anything else is answered and waited past."""
+        try:
+            async with asyncio.timeout(HELLO_TIMEOUT):
+                while True:
+                    data = await visitor.receive()
+                    visitor.dialect = Dialect(binary=isinstance(data, bytes))
+                    try:
+                        message = decode(data)
+                        if isinstance(message, kind):
+                            return message
+                        raise MessageError('the first message must be {"type":"hello","robot":"<name>"}')
+                    except MessageError as error:
+                        await self._refuse(visitor, error)
+        except TimeoutError:
+            # It may not even read: no last word for it.
+            log.warning("%s has not said hello for %.0f s and was closed", visitor.name, HELLO_TIMEOUT)
+            visitor.connection.transport.abort()
+            raise RefusedError("no hello") from None
 
-    def _take(self, robot: Robot, connection: ServerConnection) -> _Link:
+    def _take(self, robot: Robot, visitor: _Visitor) -> _Link:
         """Make this the robot's connection. One that has been silent, as after a lost link, gives way."""
         name, now = robot.config.name, time.monotonic()
         before = self._links.get(name)
         if before is not None:
+            other = before.visitor.connection
             if now - before.heard < SILENCE:
-                raise RefusedError(f'robot "{name}" is already connected, from {_address(before.connection)}')
+                raise RefusedError(f'robot "{name}" is already connected, from {_address(other)}', retry=True)
             log.info("robot %s has connected anew; its old connection was silent", name)
-            before.connection.transport.abort()
-        link = self._links[name] = _Link(connection, now)
+            other.transport.abort()
+        link = self._links[name] = _Link(visitor, now)
         robot.connected()
         return link
 
     def _hear(self, robot: Robot, link: _Link, data: str | bytes, arrival: float) -> None:
-        match decode(data):
+        dialect = link.visitor.dialect
+        match dialect.decode(data):
             case Imu() as message:
-                samples = raw_samples(message)
-                if self.ready.is_set():
-                    robot.feed_imu(samples, arrival, arrival)
+                readings = dialect.readings(message)
+                if not self.ready.is_set():
+                    return
+                restarts = robot.clock.restarts
+                robot.feed_imu(readings, arrival, arrival)
+                if robot.clock.restarts > restarts:
+                    self._note(robot.config.name, f"its clock has jumped or started anew; it reads {readings[-1][0]} s")
             case ClockAnswer(id, received, sent):
                 asked = link.questions.pop(id, None)
                 if asked is None:
                     raise MessageError(f"a clock answer with id {id}, which was not asked")
+                received, sent = dialect.seconds(received), dialect.seconds(sent)
                 if not max(abs(received), abs(sent)) < TIME_LIMIT:
-                    raise MessageError(f"a clock that reads {max(received, sent)}; seconds are needed")
+                    raise MessageError(f"a clock that reads {max(received, sent)} s; that is none")
                 robot.clock.exchange(asked, received, sent, arrival)
             case Hello():
                 raise MessageError("a second hello")
 
+    def _answer_robot(self, robot: Robot, link: _Link, subscription: Subscription) -> None:
+        """Its pose at once, with what it just sent in it, as far as the rate that it asked for allows."""
+        now = time.monotonic()
+        if subscription.topics and self.ready.is_set() and subscription.is_due(now, early=True):
+            pose = self._pose(robot, now)
+            if pose is not None:
+                self.hub.answer(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
+
     async def _ask_clock(self, link: _Link) -> None:
+        visitor = link.visitor
         for id in itertools.count():
             # A question that waits behind unsent poses would measure those.
-            if link.connection.transport.get_write_buffer_size() == 0:
+            if visitor.connection.transport.get_write_buffer_size() == 0:
                 while len(link.questions) >= CLOCK_FAST_COUNT:
                     del link.questions[next(iter(link.questions))]
                 now = link.questions[id] = time.monotonic()
-                broadcast([link.connection], encode(ClockQuestion(id, now)), text=True)
+                visitor.tell_now(ClockQuestion(id, now))
             await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
 
 
-def _for_log(error: Exception) -> str:
+def _for_log(text: str) -> str:
     """In one line of bearable length: what a client sent is quoted in it."""
-    text = str(error)
     text = text if len(text) <= 300 else text[:297] + "..."
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _lower(headers: Headers) -> dict[str, str]:
+    return {name.lower(): value for name, value in headers.raw_items()}
+
+
+def _host(connection: ServerConnection) -> str:
+    address = connection.remote_address
+    return str(address[0]) if isinstance(address, tuple) else ""
 
 
 def _address(connection: ServerConnection) -> str:
@@ -613,7 +803,7 @@ def _response(status: int, body: bytes, kind: str, request: Request) -> Response
             "Content-Type": kind,
             "Content-Length": str(len(body)),
             "Cache-Control": "no-cache",
-            "Content-Security-Policy": "default-src 'self'",
+            "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws: wss:",
             "X-Content-Type-Options": "nosniff",
         }
     )

@@ -18,7 +18,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Imported only when asked for: `steadfix detect` must not wait for the filter's compiler.
 COMMANDS = {
     "run": ("server.run", "the service: cameras and IMUs in, poses out; without a configuration a simulated room"),
+    "camera": ("server.camera_node", "the node of a remote camera: captures here, for a service elsewhere"),
     "replay": ("server.replay", "run a recording through the filter again"),
+    "markers": ("server.markers", "a sheet of markers to print"),
+    "board": ("server.board", "a calibration board to print"),
     "calibrate": ("server.calibrate", "a camera's focal length and distortion, from pictures of a board"),
     "detect": ("server.detect", "find markers in images"),
 }

@@ -22,7 +22,7 @@ DOORS = {
     "libcamera": {"camera/picamera.py"},
     "serial": {"imu/uart.py"},
     "pymavlink": {"imu/protocols/mavlink.py"},
-    "websockets": {"server/app.py", "server/robot_client.py"},
+    "websockets": {"server/app.py", "server/robot_client.py", "server/remote_cameras.py", "server/camera_node.py"},
     "filterpy": {"fusion/reference.py"},
     "numba": {"fusion/kernels.py"},
 }

@@ -1,0 +1,336 @@
+"""`steadfix camera`: the node of a remote camera. It captures and finds markers here, the service does the rest.
+
+What it sees is sent as it is seen: where the link is slower, or away, the newest frame replaces the one that waits, and
+nothing queues up. It connects again whenever the connection is lost, and opens its camera again whenever that is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import logging
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable
+from urllib.parse import urlsplit
+
+import msgspec
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import WebSocketException
+
+from camera.capture import Frame, FrameSource, open_source
+from camera.exposure import DeliveryMeter, black
+from camera.markers import MarkerDetector
+from server.camera_messages import CameraHello, CameraWelcome, FrameSeen, MarkerSeen, NodeStatus, encode, to_node
+from server.messages import ClockAnswer, ClockQuestion, Error, MessageError
+from server.terminal import log_to_stderr, until_stopped
+
+log = logging.getLogger("steadfix.camera")
+
+# s before connecting, or opening the camera, again: the first pause, which doubles up to the longest.
+FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
+# s between asking the service for a sign of life, and until a connection without one is given up.
+PING_INTERVAL, PING_TIMEOUT = 2.0, 3.0
+# s until the service must have answered the hello.
+HELLO_TIMEOUT = 10.0
+# s without a frame after which the camera counts as lost.
+READ_TIMEOUT = 5.0
+STATUS_EVERY = 1.0
+# Bytes that may wait in the kernel: what does not leave is to be replaced by what is newer.
+UNSENT = 16 * 1024
+
+Open = Callable[[CameraWelcome], FrameSource]
+
+
+class NodeError(ValueError):
+    """The node cannot do its work; the text says why, and what would be right."""
+
+
+class Watch:
+    """A thread that opens a camera as the welcome says, again whenever it is lost, and looks for markers in each frame.
+
+    `seen` gets what each frame showed, in that thread; `ended` is called there when a file is at its end. `trouble`
+    says in words what keeps it from its work, "" for nothing. Raises NodeError for a welcome that cannot be followed.
+    """
+
+    def __init__(
+        self, welcome: CameraWelcome, open: Open, seen: Callable[[FrameSeen], None], ended: Callable[[], None]
+    ) -> None:
+        self.welcome = welcome
+        self.trouble = "the camera is being opened"
+        self.meter = DeliveryMeter()
+        self._open = open
+        self._seen = seen
+        self._ended = ended
+        try:
+            self._detector = MarkerDetector(welcome.dictionary, welcome.ids)
+        except ValueError as error:
+            raise NodeError(f"the service's welcome: {error}") from None
+        self._source: FrameSource | None = None
+        self._stop = threading.Event()
+        # A daemon: a driver that hangs must not keep the node from ending.
+        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, and wait a moment for it to let go of the camera."""
+        self._stop.set()
+        if (source := self._source) is not None:
+            # Wakes a read that waits for a frame. It may itself wait for a driver that hangs.
+            threading.Thread(target=source.close, daemon=True).start()
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE
+        while not self._stop.is_set():
+            try:
+                if self._watch():
+                    self._ended()
+            except OSError as error:
+                trouble = str(error)
+            except Exception as error:
+                # A mistake of ours must not be hidden, nor end the node.
+                trouble = f"stopped by an error inside Steadfix: {error!r}"
+                log.debug("camera", exc_info=True)
+            else:
+                return
+            pause = min(2.0 * pause, LONGEST_PAUSE) if self.trouble else FIRST_PAUSE
+            if trouble != self.trouble:
+                log.warning("%s; trying again until it works", trouble)
+            self.trouble = trouble
+            self._stop.wait(pause)
+
+    def _watch(self) -> bool:
+        """Work until the source ends (True), is to stop (False) or is lost (OSError)."""
+        source = self._source = self._open(self.welcome)
+        try:
+            while (frame := source.read(READ_TIMEOUT)) is not None and not self._stop.is_set():
+                self._look(frame)
+            return not self._stop.is_set()
+        finally:
+            self._source = None
+            source.close()
+
+    def _look(self, frame: Frame) -> None:
+        start = time.monotonic()
+        self.meter.add(frame, start)
+        sightings = self._detector.detect(frame.image, frame.t)
+        if self.trouble:
+            log.info("frames are coming, %d x %d px", frame.image.shape[1], frame.image.shape[0])
+            self.trouble = ""
+        markers = [MarkerSeen(s.id, s.t, s.corners_px.tolist(), s.sigma_px) for s in sightings]
+        height_px, width_px = frame.image.shape[:2]
+        now = time.monotonic()
+        self._seen(FrameSeen(frame.t, now, frame.sequence, width_px, height_px, 1e3 * (now - start), markers))
+
+
+class Node:
+    """The connection, and what is to go over it. `run` is the whole of it.
+
+    `url`: of the service, without a path. `open`: how to open the camera that the welcome describes.
+    `dropped`: frames that were not sent.
+    """
+
+    def __init__(self, url: str, name: str, open: Open, token: str = "") -> None:
+        parts = urlsplit(url)
+        if parts.scheme not in ("ws", "wss") or not parts.netloc:
+            raise NodeError(f"--server {url}: an address such as ws://192.168.1.10:5678 is needed")
+        self._url = url.rstrip("/") + "/v1/camera"
+        self._name = name
+        self._token = token
+        self._open = open
+        self.dropped = 0
+        self._watch: Watch | None = None
+        self._latest: FrameSeen | None = None
+        self._news = asyncio.Event()
+        self._ended = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+
+    async def run(self) -> None:
+        """Until the source has ended, which a camera never does. Raises NodeError with the service's reason where it
+        refuses this camera for good."""
+        try:
+            await self._connect_again_and_again()
+        finally:
+            if self._watch is not None:
+                await asyncio.to_thread(self._watch.stop)
+
+    async def _connect_again_and_again(self) -> None:
+        pause, trouble = FIRST_PAUSE, ""
+        while not self._ended.is_set():
+            welcomed = False
+            try:
+                async with connect(
+                    self._url,
+                    compression=None,
+                    max_size=1 << 16,
+                    ping_interval=PING_INTERVAL,
+                    ping_timeout=PING_TIMEOUT,
+                    proxy=None,
+                ) as connection:
+                    async with asyncio.timeout(HELLO_TIMEOUT):
+                        await self._begin(connection)
+                    welcomed = True
+                    log.info("connected to %s as camera %s", self._url, self._name)
+                    await self._talk(connection)
+                reason = "the service has ended the connection"
+            except (OSError, WebSocketException) as error:
+                reason = str(error) or type(error).__name__
+            if self._ended.is_set():
+                break
+            if welcomed:
+                pause, trouble = FIRST_PAUSE, ""
+            if reason != trouble:
+                log.warning("no connection to %s: %s; trying again until it works", self._url, reason)
+            trouble = reason
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._ended.wait()
+            pause = min(2.0 * pause, LONGEST_PAUSE)
+
+    async def _begin(self, connection: ClientConnection) -> None:
+        """Hello and welcome; the camera is opened if it is not, or with other settings than now wanted."""
+        # What is not taken by the network yet waits where newer can replace it.
+        connection.transport.set_write_buffer_limits(high=0)
+        sock = connection.transport.get_extra_info("socket")
+        if sock is not None and hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
+        await connection.send(encode(CameraHello(self._name, self._token)), text=True)
+        welcome = to_node(await connection.recv())
+        if isinstance(welcome, Error):
+            if self._watch is not None:
+                raise ConnectionRefusedError(f"refused: {welcome.reason}")  # it was welcome before
+            raise NodeError(f"the service refuses camera {self._name}: {welcome.reason}")
+        if not isinstance(welcome, CameraWelcome):
+            raise MessageError("a first message that is no welcome")
+        if self._watch is not None and self._watch.welcome != welcome:
+            log.info("the service's configuration of this camera has changed")
+            await asyncio.to_thread(self._watch.stop)
+            self._watch = None
+        if self._watch is None:
+            self._watch = Watch(welcome, self._open, self._see, self._end)
+        # Nobody needs what was seen before.
+        self._latest = None
+        self._news.clear()
+
+    async def _talk(self, connection: ClientConnection) -> None:
+        """Send and receive, until the connection or the source is at its end."""
+        works = [
+            asyncio.create_task(work)
+            for work in (self._send(connection), self._report(connection), self._hear(connection))
+        ]
+        try:
+            done, _ = await asyncio.wait(works, return_when=asyncio.FIRST_COMPLETED)
+            for work in done:
+                work.result()
+        finally:
+            for work in works:
+                work.cancel()
+            await asyncio.gather(*works, return_exceptions=True)
+
+    # From the thread of the camera
+
+    def _see(self, seen: FrameSeen) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop may be closed already
+            self._loop.call_soon_threadsafe(self._put, seen)
+
+    def _end(self) -> None:
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._finish)
+
+    # In the loop
+
+    def _put(self, seen: FrameSeen) -> None:
+        if self._latest is not None:
+            self.dropped += 1
+        self._latest = seen
+        self._news.set()
+
+    def _finish(self) -> None:
+        log.info("the source has ended")
+        self._ended.set()
+        self._news.set()
+
+    async def _send(self, connection: ClientConnection) -> None:
+        """The newest frame, whenever the last one has left; ends with the source."""
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            seen, self._latest = self._latest, None
+            if seen is not None:
+                await connection.send(encode(msgspec.structs.replace(seen, sent=time.monotonic())), text=True)
+            if self._ended.is_set():
+                await connection.send(encode(self._status("the source has ended")), text=True)
+                return
+
+    async def _report(self, connection: ClientConnection) -> None:
+        while True:
+            assert self._watch is not None
+            await connection.send(encode(self._status(self._watch.trouble)), text=True)
+            await asyncio.sleep(STATUS_EVERY)
+
+    def _status(self, trouble: str) -> NodeStatus:
+        assert self._watch is not None
+        delivery = self._watch.meter.delivery(time.monotonic())
+        exposure, white, saturated = (
+            value if math.isfinite(value) else None for value in (delivery.exposure, delivery.white, delivery.saturated)
+        )
+        trouble = trouble or black(delivery)
+        return NodeStatus(trouble, delivery.rate_hz, delivery.used_hz, exposure, white, saturated, self.dropped)
+
+    async def _hear(self, connection: ClientConnection) -> None:
+        """Answer the service's questions, until it ends the connection."""
+        said = ""
+        async for data in connection:
+            received = time.monotonic()
+            try:
+                message = to_node(data)
+            except MessageError as error:
+                log.debug("a message of a newer service? %s", error)
+                continue
+            match message:
+                case ClockQuestion(id=id):
+                    await connection.send(encode(ClockAnswer(id, received, time.monotonic())), text=True)
+                case Error(reason=reason) if reason != said:
+                    said = reason
+                    log.warning("the service says: %s", reason)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.add_argument(
+        "source",
+        metavar="SOURCE",
+        help='a camera number, "/dev/video0", "rtsp://...", "picamera", a video file or a folder of images',
+    )
+    parser.add_argument("--server", required=True, metavar="URL", help="of the service, such as ws://192.168.1.10:5678")
+    parser.add_argument("--name", required=True, help='of the camera: that [[camera]] has source = "remote" there')
+    parser.add_argument("--token", default="", help="of the camera, where the service asks for one")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the command. Raises NodeError, and OSError for nothing: what is lost is tried again."""
+    log_to_stderr()
+
+    def open_here(welcome: CameraWelcome) -> FrameSource:
+        return open_source(
+            args.source,
+            width_px=welcome.width_px,
+            height_px=welcome.height_px,
+            frame_rate_hz=welcome.frame_rate_hz,
+            pixel_format=welcome.pixel_format,
+            exposure=1e-3 * welcome.exposure_ms,
+            gain=welcome.gain,
+            line_time=welcome.line_time,
+        )
+
+    asyncio.run(_run(args, open_here))
+    return 0
+
+
+async def _run(args: argparse.Namespace, open: Open) -> None:
+    node = Node(args.server, args.name, open, args.token)
+    await until_stopped(node.run())

@@ -1,0 +1,213 @@
+"""Cameras on other machines: their nodes (`server.camera_node`) capture and find markers, the service does the rest.
+
+The calibration stays with the service, as do the anchors and robots that it belongs with: a node has nothing but its
+name and the address of the service, and all else that it needs to know comes with the welcome.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import math
+import threading
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.server import ServerConnection, broadcast
+
+from camera.exposure import Delivery
+from camera.markers import MarkerSighting
+from imu.clock import DeviceClock
+from server.camera_messages import CameraHello, CameraWelcome, FrameSeen, NodeStatus, encode, from_node
+from server.cameras import Camera, Seen, SightedFrame
+from server.config import CameraConfig, Config
+from server.messages import ClockAnswer, ClockQuestion, MessageError
+
+log = logging.getLogger("steadfix.camera")
+
+# s between clock questions, for the first ones and then.
+CLOCK_FAST, CLOCK_FAST_COUNT, CLOCK_SLOW = 0.1, 10, 1.0
+# s without a word after which a node counts as gone, and another connection of it may take its place.
+SILENCE = 3.0
+
+
+class RemoteFrames:
+    """The frames of a node as a source: the newest waits to be read, as with a camera that is here."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._frame: SightedFrame | None = None
+        self._closed = False
+
+    def put(self, frame: SightedFrame) -> None:
+        """A frame came; one that was not read yet is forgotten."""
+        with self._changed:
+            self._frame = frame
+            self._changed.notify_all()
+
+    def read(self, timeout: float) -> SightedFrame | None:
+        """The next frame, None once closed. Waits for as long as the node is away, who says so by other means."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._frame is not None)
+            frame, self._frame = self._frame, None
+            return None if self._closed else frame
+
+    def close(self) -> None:
+        """Ends a `read` that waits."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+class RemoteCamera(Camera):
+    """A Camera whose frames come over a connection, one at a time, from whichever node bears its name.
+
+    `serve` is for the service's loop, the rest as in Camera.
+    """
+
+    def __init__(
+        self,
+        config: CameraConfig,
+        room: Config,
+        deliver: Callable[[Seen], None],
+        tracker_wanted: Callable[[], bool] = lambda: False,
+    ) -> None:
+        super().__init__(config, room, deliver, tracker_wanted, self._open_frames)
+        self.status = (
+            "its node has not connected yet; on the machine with the camera: "
+            f"steadfix camera --server ws://<this machine>:{room.server.port} --name {config.name}"
+        )
+        self.clock = DeviceClock()
+        self.node = ""
+        self.dropped = 0
+        self._frames = RemoteFrames()
+        self._connection: ServerConnection | None = None
+        self._heard = -math.inf
+        self._delivery: Delivery | None = None
+        self._trouble = ""
+
+    def _open_frames(self, config: CameraConfig) -> RemoteFrames:
+        self._frames = RemoteFrames()
+        return self._frames
+
+    def refusal(self, now: float) -> str:
+        """Why no second connection can be this camera's, or "": one that is silent, as after a lost link, gives way."""
+        if self._connection is None or now - self._heard >= SILENCE:
+            return ""
+        return f'camera "{self.config.name}" is already connected, from {self.node}'
+
+    async def serve(
+        self, connection: ServerConnection, node: str, service: str, refuse: Callable[[MessageError], Awaitable[None]]
+    ) -> None:
+        """One connection, after its hello, until it ends or is silent. `node`: where it comes from, in words."""
+        if self._connection is not None:
+            self._connection.transport.abort()
+        self._connection, self.node, self._heard = connection, node, time.monotonic()
+        # The node may be another than before, or started anew.
+        self.clock, self._delivery = DeviceClock(), None
+        self._trouble = ""
+        self._say(f"its node has connected, from {node}, but has sent no frame yet")
+        config = self.config
+        welcome = CameraWelcome(
+            camera=config.name,
+            service=service,
+            dictionary=config.dictionary,
+            ids=sorted(self.ids),
+            still=sorted(self.anchor_ids),
+            width_px=config.width_px,
+            height_px=config.height_px,
+            frame_rate_hz=config.frame_rate_hz,
+            pixel_format=config.pixel_format,
+            exposure_ms=config.exposure_ms,
+            gain=config.gain,
+            line_time=config.line_time,
+        )
+        questions: dict[int, float] = {}
+        asking = None
+        try:
+            await connection.send(encode(welcome), text=True)
+            asking = asyncio.create_task(self._ask_clock(connection, questions))
+            async for data in connection:
+                arrival = self._heard = time.monotonic()
+                try:
+                    self._hear(questions, data, arrival)
+                except MessageError as error:
+                    await refuse(error)
+        finally:
+            if asking is not None:
+                asking.cancel()
+            if self._connection is connection:
+                self._connection = None
+                # A frame may have come after what the node said last.
+                self._say(f"its node ({node}) has gone; waiting for it{self._trouble and f' ({self._trouble})'}")
+
+    def _say(self, status: str) -> None:
+        if status != self.status:
+            self.status = status
+            log.info("camera %s: %s", self.config.name, status)
+
+    async def _ask_clock(self, connection: ServerConnection, questions: dict[int, float]) -> None:
+        for id in itertools.count():
+            while len(questions) >= CLOCK_FAST_COUNT:
+                del questions[next(iter(questions))]
+            now = questions[id] = time.monotonic()
+            broadcast([connection], encode(ClockQuestion(id, now)), text=True)
+            if now - self._heard >= SILENCE and self._connection is connection:
+                self._say(f"its node ({self.node}) says nothing any more; waiting for it")
+            await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
+
+    def _hear(self, questions: dict[int, float], data: str | bytes, arrival: float) -> None:
+        match from_node(data):
+            case FrameSeen() as seen:
+                self.clock.observe(seen.sent, arrival)
+                # What has no time yet has to wait for the answer to the first question, which is under way.
+                if self.clock.minimum_delay is not None:
+                    self._frames.put(self._frame(seen))
+            case ClockAnswer(id, received, sent):
+                asked = questions.pop(id, None)
+                if asked is None:
+                    raise MessageError(f"a clock answer with id {id}, which was not asked")
+                if not math.isfinite(received) or not math.isfinite(sent):
+                    raise MessageError("a clock that reads no finite number of seconds")
+                self.clock.exchange(asked, received, sent, arrival)
+            case NodeStatus() as status:
+                known = (math.nan if x is None else x for x in (status.exposure, status.white, status.saturated))
+                self._delivery = Delivery(status.rate_hz, status.used_hz, *known)
+                self.dropped = status.dropped
+                self._trouble = status.trouble
+                if status.trouble:
+                    self._say(status.trouble)
+            case CameraHello():
+                raise MessageError("a second hello")
+
+    def _frame(self, seen: FrameSeen) -> SightedFrame:
+        if unknown := {marker.id for marker in seen.markers} - self.ids:
+            raise MessageError(f"markers that were not asked for: {sorted(unknown)}")
+        if not seen.t <= seen.sent:
+            raise MessageError(f"a frame of {seen.t - seen.sent:.3g} s after it was sent")
+        to_host, offset = self.clock.to_host, self.config.time_offset
+        sightings = [
+            MarkerSighting(
+                to_host(marker.t) + offset, self.config.name, marker.id, np.array(marker.corners_px), marker.sigma_px
+            )
+            for marker in sorted(seen.markers, key=lambda marker: marker.id)
+        ]
+        return SightedFrame(
+            to_host(seen.t) + offset, seen.sequence, seen.width_px, seen.height_px, sightings, seen.detect_ms
+        )
+
+    def delivery(self, now: float) -> Delivery | None:
+        """As its node measured it."""
+        return self._delivery
+
+    def health(self, now: float) -> dict[str, Any]:
+        delay = self.clock.minimum_delay
+        return super().health(now) | {
+            "node": self.node if self._connection is not None else None,
+            "clock_skew_ppm": round(self.clock.skew * 1e6, 1),
+            "link_delay_ms": None if delay is None else round(delay * 1e3, 2),
+            "frames_dropped": self.dropped,
+        }
