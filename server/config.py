@@ -73,6 +73,8 @@ class CameraConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """s from one row's exposure to the next one's; 0: all together."""
     time_offset: Annotated[float, Meta(ge=-2.0, le=2.0)] = 0.0
     """s, added to the stamps of its frames."""
+    token: str = ""
+    """Of the node of a remote camera, plain or `sha256:` and hexadecimal; "": a node on this machine, without."""
     placement: str = ""
     """Path of where it hangs, as `steadfix floor` writes it; "": found from the anchors in view. `load` makes it
     absolute."""
@@ -231,6 +233,7 @@ def _check(config: Config, source: _Source) -> None:
             raise source.error(("server", given), f'the key "{other}" is missing: {_RIGHT[other]}')
     tokens: list[tuple[KeyPath, str]] = [(("server", "token"), config.server.token)]
     tokens += [(("robot", i, "token"), robot.token) for i, robot in enumerate(config.robot)]
+    tokens += [(("camera", i, "token"), camera.token) for i, camera in enumerate(config.camera)]
     for path, token in tokens:
         if token.startswith(HASHED) and not re.fullmatch(HASHED + "[0-9A-Fa-f]{64}", token):
             raise source.error(path, f"found {_shown(token)}; needed: {_RIGHT['token']}")
