@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 
 from fusion.params import Engine, FilterParams, Motion
+from imu.mounting import ImuCalibration
 from server.access import HASHED
 
 DEFAULT_PORT = 5678
@@ -94,7 +96,7 @@ class MarkerConfig(Struct, frozen=True, forbid_unknown_fields=True):
     yaw_deg: Degrees = 0.0
 
 
-class ImuConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class ImuConfig(ImuCalibration, frozen=True, forbid_unknown_fields=True):
     source: Text = "websocket"
     protocol: Literal["json", "csv"] = "json"
     baud: Annotated[int, Meta(ge=1200, le=12_000_000)] = 115200
@@ -151,6 +153,11 @@ _RIGHT = {
     "id": "the number of the marker in its dictionary, 0 or more",
     "size_mm": "the side of the marker's black square in millimetres, 5 to 2000",
     "position_m": "three numbers [x, y, z] in metres, each within 1000",
+    "imu.position_m": "three numbers [forward, left, up] in metres from the robot's origin, each within 10",
+    "rotation_deg": "three angles [roll, pitch, yaw] in degrees, each -360 to 360",
+    "gyro_bias": "three numbers [x, y, z] in rad/s, each within 1, as `steadfix imu-rest` prints them",
+    "accel_bias": "three numbers [x, y, z] in m/s2, each within 5, as `steadfix imu-positions` prints them",
+    "accel_matrix": "three rows of three numbers, near 1 on the diagonal, as `steadfix imu-positions` prints them",
     "yaw_deg": "an angle in degrees, anticlockwise, -360 to 360",
     "motion": '"ground", "differential" or "free"',
     "engine": '"numba" or "filterpy"',
@@ -226,6 +233,9 @@ def _check(config: Config, source: _Source) -> None:
         once("the robot name", robot.name, ("robot", i, "name"))
         for j, marker in enumerate(robot.marker):
             once("the marker id", marker.id, ("robot", i, "marker", j, "id"))
+        if not 0.5 < np.linalg.det(robot.imu.accel_matrix) < 2.0:
+            matrix: KeyPath = ("robot", i, "imu", "accel_matrix")
+            raise source.error(matrix, f"found {_shown(robot.imu.accel_matrix)}; needed: {_right(matrix)}")
         if robot.imu.source != "websocket":
             once("the serial port", robot.imu.source, ("robot", i, "imu", "source"))
     for given, other in (("certificate", "key"), ("key", "certificate")):
@@ -322,7 +332,7 @@ def _right(path: KeyPath) -> str:
         return _SOURCE.get(names[0], "")
     if "filter" in names[:-1]:
         return _range(names[-1])
-    return _RIGHT.get(names[-1], "") if names else ""
+    return _RIGHT.get(".".join(names[-2:]), _RIGHT.get(names[-1], "")) if names else ""
 
 
 def _range(parameter: str) -> str:

@@ -1,6 +1,8 @@
 """Recording folders: inputs as CSV, one folder a robot, so that a run can be done again.
 
-    imu.csv     t_s,gx,gy,gz,ax,ay,az            rad/s and m/s2 in body axes; optional arrival_s
+    imu.csv     t_s,gx,gy,gz,ax,ay,az            rad/s and m/s2; optional arrival_s
+    imu.toml    position_m, rotation_deg, ...    optional: how imu.csv, which is what the IMU read, becomes readings at
+                the body's origin along its axes, as `imu.mounting` says; without it imu.csv holds those
     fixes.csv   t_s,arrival_s,x,y,z,qw,qx,qy,qz  world_from_body at t_s; optional sigma_position,sigma_attitude
                 (m, rad), or what a camera knows more: misfit, source, markers (ids, with spaces between), cov_00 ...
                 cov_55 (upper triangle of the covariance as in `fusion.measurements`), and a second hypothesis with
@@ -16,14 +18,17 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Iterator, Sequence
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
+import msgspec
 import numpy as np
 
 from fusion.measurements import Array, ImuBatch, MeasurementError, PoseFix, PoseHypothesis
 from fusion.params import FilterParams
+from imu.mounting import BodyReadings, ImuCalibration, toml_lines
 
 IMU_COLUMNS = ("t_s", "gx", "gy", "gz", "ax", "ay", "az")
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -48,7 +53,7 @@ class RecordingError(ValueError):
 class Recording(NamedTuple):
     """What one robot's folder holds.
 
-    `samples` (n, 7) as in `ImuBatch`, in order of arrival; `arrival` (n,) s; `fixes` in order of arrival;
+    `samples` (n, 7) as in `ImuBatch`, of the body, in order of arrival; `arrival` (n,) s; `fixes` in order of arrival;
     `truth` (m, 8): t, position, quaternion wxyz, or None.
     """
 
@@ -72,9 +77,26 @@ def robot_folders(folder: Path) -> list[Path]:
     return found
 
 
-def load(folder: Path, params: FilterParams | None = None) -> Recording:
-    """Read and check one robot's folder. Fixes without a covariance get that of `params`. Raises RecordingError."""
+def load_calibration(folder: Path) -> ImuCalibration:
+    """What a robot's folder says of its IMU. Raises RecordingError."""
+    path = folder / "imu.toml"
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), ImuCalibration)
+    except FileNotFoundError:
+        return ImuCalibration()
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"{path}: {error}") from None
+
+
+def load(folder: Path, params: FilterParams | None = None, calibration: ImuCalibration | None = None) -> Recording:
+    """Read and check one robot's folder. Raises RecordingError.
+
+    Fixes without a covariance get that of `params`. `calibration` is taken instead of the recording's own.
+    """
     params = params or FilterParams()
+    to_body = BodyReadings(load_calibration(folder) if calibration is None else calibration)
     imu_path = folder / "imu.csv"
     names = _header(imu_path, IMU_COLUMNS)
     table = _numbers(imu_path, names, (*IMU_COLUMNS, *(["arrival_s"] if "arrival_s" in names else [])))
@@ -90,7 +112,7 @@ def load(folder: Path, params: FilterParams | None = None) -> Recording:
     fixes = _load_fixes(folder / "fixes.csv", params)
     if not fixes:
         raise RecordingError(f"{folder / 'fixes.csv'}: no fix after the header; without one there is no start")
-    return Recording(folder.resolve().name, np.ascontiguousarray(table[:, :7]), arrival, fixes, truth)
+    return Recording(folder.resolve().name, to_body(np.ascontiguousarray(table[:, :7])), arrival, fixes, truth)
 
 
 def _open(path: Path) -> TextIO:
@@ -228,11 +250,13 @@ class Recorder:
     """Writes a recording folder with a folder for each robot, as things arrive.
 
     What is fed must be recorded in the order in which it is fed, with the `arrival` of that moment. Each line is in
-    the file by the end of the second. Raises RecordingError if the folder holds a recording already, OSError if it
-    cannot be made.
+    the file by the end of the second. `calibrations`: of the robots' IMUs, by name; who is absent has a perfect one.
+    Raises RecordingError if the folder holds a recording already, OSError if it cannot be made.
     """
 
-    def __init__(self, folder: Path, robots: Iterable[str]) -> None:
+    def __init__(
+        self, folder: Path, robots: Iterable[str], calibrations: Mapping[str, ImuCalibration] | None = None
+    ) -> None:
         self._folder = folder
         self._files: dict[tuple[str, str], TextIO] = {}
         for robot in robots:
@@ -240,6 +264,9 @@ class Recorder:
                 raise RecordingError(f"{folder / robot}: holds a recording already; name a new folder")
             for file, columns in (("imu.csv", (*IMU_COLUMNS, "arrival_s")), ("fixes.csv", FIX_COLUMNS)):
                 self._write(robot, file, columns)
+        for robot, calibration in (calibrations or {}).items():
+            if lines := toml_lines(calibration):
+                (folder / robot / "imu.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def _write(self, robot: str, name: str, values: Iterable[Any], separator: str = ",") -> None:
         file = self._files.get((robot, name))
@@ -249,7 +276,7 @@ class Recorder:
         file.write(separator.join(value if isinstance(value, str) else repr(float(value)) for value in values) + "\n")
 
     def imu(self, batch: ImuBatch) -> None:
-        """The samples of a batch."""
+        """The samples of a batch, as the IMU gave them."""
         for row in batch.samples.tolist():
             self._write(batch.robot, "imu.csv", (*row, batch.arrival))
 

@@ -19,6 +19,7 @@ from fusion.health import Health
 from fusion.localiser import Localiser, warm_up
 from fusion.measurements import Array, FixOutcome, Outcome
 from fusion.params import Channel, Engine, FilterParams, Motion
+from imu.mounting import ImuCalibration
 from server import config
 from server.recording import Recording, RecordingError, load, robot_folders, write_tum
 
@@ -32,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("recording", type=Path, help="folder with imu.csv and fixes.csv, or one of such folders")
     parser.add_argument("--out", type=Path, metavar="POSES", help="write a pose per IMU sample, in TUM format")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="motion model and noise of the robot from here")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="motion model, noise and IMU mounting from here")
     parser.add_argument("--robot", metavar="NAME", help="which robot of the configuration it is")
     parser.add_argument("--engine", choices=get_args(Engine), help="default: the robot's, else numba")
     parser.add_argument("--motion", choices=get_args(Motion), help="default: the robot's, else ground")
@@ -179,8 +180,9 @@ def _table(s: Any) -> str:
     return "\n".join(lines)
 
 
-def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion, Engine]:
+def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion, Engine, ImuCalibration | None]:
     params = FilterParams()
+    imu: ImuCalibration | None = None
     motion: Motion = "ground"
     engine: Engine = "numba"
     if args.config is not None:
@@ -192,8 +194,8 @@ def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion
                 "say with --robot which one the recording is of"
             )
         robot = robots[wanted]
-        params, motion, engine = robot.filter, robot.motion, robot.engine
-    return params, args.motion or motion, args.engine or engine
+        params, motion, engine, imu = robot.filter, robot.motion, robot.engine, robot.imu
+    return params, args.motion or motion, args.engine or engine, imu
 
 
 def _compile() -> None:
@@ -220,9 +222,9 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None and len(folders) > 1:
         args.out.mkdir(parents=True, exist_ok=True)
     for folder in folders:
-        params, motion, engine = _settings(args, folder.resolve().name)
+        params, motion, engine, imu = _settings(args, folder.resolve().name)
         try:
-            recording = load(folder, params)
+            recording = load(folder, params, imu)
         except RecordingError as error:
             if len(folders) == 1:
                 raise

@@ -16,6 +16,7 @@ from fusion.localiser import Localiser
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix
 from imu.clock import DeviceClock
 from imu.protocols import RawSample
+from imu.mounting import BodyReadings
 from server.config import RobotConfig
 from server.messages import encode, pose_message
 
@@ -23,6 +24,7 @@ from server.messages import encode, pose_message
 RATE_WINDOW = 2.0
 # Seconds for which a diagnosis must not have been made until it is gone: one at its threshold comes and goes.
 GONE_AFTER = 30.0
+_STAMPS = {None: "none yet", True: "by the IMU's own clock", False: "at arrival, since it sends none"}
 
 
 class Recording(Protocol):
@@ -45,6 +47,7 @@ class Robot:
         self.vitals = Health(self.localiser)
         self.diagnoses: list[Diagnosis] = []
         self.clock = DeviceClock()
+        self._to_body = BodyReadings(config.imu)
         # Why no IMU data come, in words, or "" while they do.
         self.trouble = "no IMU has connected yet"
         self.dropped = 0
@@ -72,10 +75,12 @@ class Robot:
         self._arrivals.append((arrival, len(raw)))
         while self._arrivals[0][0] < arrival - RATE_WINDOW:
             self._arrivals.popleft()
-        batch = ImuBatch(self.config.name, now, self.clock.stamp(raw, arrival))
-        track = np.full((len(raw), 8), np.nan)
+        readings = self.clock.stamp(raw, arrival)
         if self._recording is not None:
-            self._recording.imu(batch)
+            # As the IMU gave them: how they become the body's is in the recording too.
+            self._recording.imu(ImuBatch(self.config.name, now, readings))
+        batch = ImuBatch(self.config.name, now, self._to_body(readings))
+        track = np.full((len(raw), 8), np.nan)
         self.vitals.judged(self.localiser.feed(batch, track))
         self.vitals.sampled(batch.samples, track)
         if self._recording is not None:
@@ -139,6 +144,7 @@ class Robot:
             "imu_refused": self.dropped,
             "clock_skew_ppm": round(self.clock.skew * 1e6, 1),
             "clock_restarts": self.clock.restarts,
+            "stamps": _STAMPS[self.clock.has_stamps],
             "link_delay_ms": None if delay is None else round(delay * 1e3, 2),
             "poses_published": self.published,
             "reset_id": 0 if pose is None else pose.reset_id,

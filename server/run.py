@@ -64,7 +64,8 @@ async def _serve_until(
     async with contextlib.AsyncExitStack() as stack:
         recorder = None
         if args.record is not None:
-            recorder = stack.enter_context(contextlib.closing(Recorder(args.record, [r.name for r in config.robot])))
+            imus = {robot.name: robot.imu for robot in config.robot}
+            recorder = stack.enter_context(contextlib.closing(Recorder(args.record, imus, imus)))
         if room is None:
             service = Service(config, recorder)
         else:
