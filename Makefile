@@ -29,17 +29,18 @@ $(VENV)/bin/python:
 
 $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/bin/python
 	@echo "Installing Steadfix into $(VENV) (once)"
-	@$(PIP) install -r requirements.lock
+	@$(PIP) install --no-deps -r requirements.lock
 	@$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
 $(VENV)/.development: requirements-dev.lock $(VENV)/.runtime
 	@echo "Installing the test tools into $(VENV) (once)"
-	@$(PIP) install -r requirements-dev.lock
+	@$(PIP) install --no-deps -r requirements-dev.lock
 	@touch $@
 
 # Universal locks: one file for every Python >= 3.11 and platform, versions only. No hashes, because
-# Raspberry Pi OS installs from wheels of its own build.
+# Raspberry Pi OS installs from wheels of its own build. They are complete, hence --no-deps above: what
+# pyproject.toml says a package does not need must not come after all.
 LOCK := $(VENV)/bin/uv pip compile --quiet --universal --python-version 3.11 --no-emit-index-url --no-emit-find-links \
   --no-annotate --no-header --upgrade pyproject.toml
 lock:
