@@ -108,6 +108,8 @@ def _column(i: int, text: str, *, strict: bool) -> tuple[str, str, float]:
         except ValueError:
             factor = math.nan
     if not math.isfinite(factor) or factor == 0.0:
+        if kind == "t" and not strict:
+            return "", "", 1.0  # a temperature
         known = ", ".join(list(_UNITS[kind])[:6])
         raise ColumnsError(f'column {i + 1}, "{text}": unknown unit; known: {known}, or a number to multiply by')
     return kind, match[1], factor

@@ -108,7 +108,7 @@ def describe(data: bytes) -> str:
             what += '; its columns have to be named, such as "t[us],gx[deg/s],gy[deg/s],gz[deg/s],ax[g],ay[g],az[g]"'
         return what
     if data.count(data[:1]) == len(data):
-        return f"nothing but the byte {data[0]:#04x}: a wrong baud rate, or a line that hangs" if data else "nothing"
+        return f"nothing but the byte {data[0]:#04x}: a wrong baud rate, or a line that hangs"
     return f"neither text nor known frames, but {data[:12].hex(' ')} ...: a wrong baud rate, or an unknown protocol"
 
 

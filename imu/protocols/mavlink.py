@@ -75,7 +75,8 @@ class Mavlink(FrameParser):
         if kind not in _FINENESS:
             return None
         message = self._decoder.decode(bytearray(frame))
-        source = (system, component, getattr(message, "id", 0))
+        # SCALED_IMU is of the first IMU; there `id` would be the message's own number.
+        source = (system, component, 0 if kind == _SCALED_IMU else message.id)
         if self._source is None:
             self._source, self._sequence = source, sequence
         if source != self._source or _FINENESS.index(kind) < _FINENESS.index(self._finest):
