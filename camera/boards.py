@@ -188,8 +188,8 @@ class BoardDetector:
         found, _, grid = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
         size = sorted(grid.shape[:2], reverse=True) if found else []
         if size and size != sorted((self.board.columns, self.board.rows), reverse=True):
-            square = 1e3 * self.board.square
-            return f"it shows {size[0]} x {size[1]} inner corners; is it --board chessboard:{size[0]}x{size[1]}:{square:g}mm?"
+            right = Board("chessboard", size[0], size[1], self.board.square)
+            return f"it shows {size[0]} x {size[1]} inner corners; is it --board {right}?"
         return "no chessboard is seen"
 
     def _chessboard(self, picture: Image, thorough: bool) -> tuple[NDArray[np.integer], Array] | None:

@@ -1,4 +1,4 @@
-"""`steadfix calibrate`: a camera's focal length and distortion from pictures of a board, live and guided or from files."""
+"""`steadfix calibrate`: a camera's focal length and distortion, from pictures of a board: live or from files."""
 
 from __future__ import annotations
 
