@@ -10,24 +10,26 @@ axes of the frame that the pose is given in (the left frame in `a_from_b`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from camera.calibration import Intrinsics
 from camera.markers import MarkerSighting
+from camera.tracking import Prediction
 from fusion.geometry import (
     exp_so3,
     inverse,
     quaternion_from_rotation,
-    rotation_about_z,
+    rotation_from_quaternion,
     skew,
     transform,
     transform_points,
 )
-from fusion.measurements import Array, PoseFix, PoseHypothesis
+from fusion.measurements import Array, Pose, PoseFix, PoseHypothesis
 
 # What the planar solve takes as known is known this well: the height of the body above the floor, m, ...
 FLOOR_HEIGHT_SIGMA = 0.005
@@ -50,6 +52,23 @@ class MarkerMount:
 
 # A marker of a body with where it was seen.
 Seen = tuple[MarkerMount, MarkerSighting]
+
+
+class Body:
+    """A robot with its markers.
+
+    `planar`: it stands level on the floor (z = 0), known to FLOOR_HEIGHT_SIGMA and FLOOR_TILT_SIGMA, and the corners
+    tell x, y and yaw: far better determined than six unknowns, because a marker seen from straight above hardly shows
+    its tilt. `corners`: (4, 3) m in the body's frame, by the marker's id.
+    """
+
+    def __init__(self, name: str, mounts: Sequence[MarkerMount], *, planar: bool) -> None:
+        self.name = name
+        self.mounts = {mount.id: mount for mount in mounts}
+        self.planar = planar
+        self.corners = {
+            mount.id: transform_points(mount.body_from_marker, marker_corners(mount.size)) for mount in mounts
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +148,7 @@ class View:
         expected, by_point = project(points_camera, self.intrinsics)
         by_position = by_point @ self.world_from_camera[:3, :3].T
         lever = points_world - world_from_body[:3, 3]
-        # d(p + exp(dtheta) R x) / d dtheta = -skew(R x)
-        by_rotation = np.stack([-J @ skew(x) for J, x in zip(by_position, lever, strict=True)])
+        by_rotation = _by_rotation(by_position, lever)
         weight = 1.0 / self.sigma_px
         residual = (self.corners_px - expected) * weight[:, None]
         jacobian = np.concatenate([by_position, by_rotation], axis=2) * weight[:, None, None]
@@ -213,35 +231,81 @@ def marker_poses(
 
 
 def solve(
-    robot: str,
-    mounts: Sequence[MarkerMount],
+    bodies: Sequence[Body],
     sightings: Sequence[MarkerSighting],
     intrinsics: Intrinsics,
     world_from_camera: Array,
     *,
-    planar: bool,
     arrival: float,
     placement_covariance: Array | None = None,
-) -> PoseFix | None:
-    """The pose of one robot from what one frame of one camera saw of its markers, all of them jointly.
+) -> list[PoseFix]:
+    """The poses of all bodies of which one frame of one camera shows a marker; each from all of its markers jointly.
 
-    `planar`: the body stands level on the floor (z = 0), known to FLOOR_HEIGHT_SIGMA and FLOOR_TILT_SIGMA, and the
-    corners tell x, y and yaw: far better determined than six unknowns, because a marker seen from straight above hardly
-    shows its tilt. Otherwise all six, with up to two hypotheses.
-    `placement_covariance`: (6, 6) of `world_from_camera`, position and rotation, world axes.
-    Returns None if no marker of the robot is among the sightings, or none that a pose in front of the camera explains.
+    A body that is not planar has all six unknowns, and up to two hypotheses. `placement_covariance`: (6, 6) of
+    `world_from_camera`, position and rotation, world axes. A body that no pose in front of the camera explains is left
+    out.
     """
-    by_id = {mount.id: mount for mount in mounts}
-    seen = [(by_id[sighting.id], sighting) for sighting in sightings if sighting.id in by_id]
-    if not seen:
-        return None
     placement = np.zeros((6, 6)) if placement_covariance is None else placement_covariance
-    view = View.of(seen, world_from_camera, intrinsics)
-    hypotheses = _planar(view, placement) if planar else _six(view, seen, placement)
-    if not hypotheses:
-        return None
-    markers = tuple(mount.id for mount, _ in seen)
-    return PoseFix(robot, seen[0][1].t, arrival, tuple(hypotheses[:2]), seen[0][1].camera, markers)
+    by_id = {sighting.id: sighting for sighting in sightings}
+    seen = [(body, [by_id[id] for id in body.corners if id in by_id]) for body in bodies]
+    seen = [(body, markers) for body, markers in seen if markers]
+    found: dict[str, list[PoseHypothesis]] = {}
+    planar = [(body, markers) for body, markers in seen if body.planar]
+    if planar:
+        found |= _planar(planar, world_from_camera, intrinsics, placement)
+    for body, markers in seen:
+        if not body.planar:
+            pairs = [(body.mounts[sighting.id], sighting) for sighting in markers]
+            found[body.name] = _six(View.of(pairs, world_from_camera, intrinsics), pairs, placement)
+    return [
+        PoseFix(
+            body.name,
+            sum(sighting.t for sighting in markers) / len(markers),
+            arrival,
+            tuple(hypotheses[:2]),
+            markers[0].camera,
+            tuple(sighting.id for sighting in markers),
+        )
+        for body, markers in seen
+        if (hypotheses := found.get(body.name))
+    ]
+
+
+def predict(
+    bodies: Sequence[Body],
+    poses: Mapping[str, Pose],
+    intrinsics: Intrinsics,
+    world_from_camera: Array,
+    line_time: float = 0.0,
+) -> dict[int, Prediction]:
+    """Where the markers of bodies with known poses, by name, should be seen; those in front of the camera only.
+
+    The poses are for the exposure of the image's first row. `line_time`: s from one row's exposure to the next one's.
+    """
+    known = [
+        (poses[body.name], id, points) for body in bodies if body.name in poses for id, points in body.corners.items()
+    ]
+    if not known:
+        return {}
+    position = np.array([pose.position for pose, _, _ in known])
+    R = np.array([rotation_from_quaternion(pose.quaternion_wxyz) for pose, _, _ in known])
+    # (m, 4, 3): a marker's corners from its body's origin, along the world's axes
+    lever = np.array([points for _, _, points in known]) @ R.transpose(0, 2, 1)
+    camera = world_from_camera[:3, 3]
+    in_camera = (lever + position[:, None] - camera) @ world_from_camera[:3, :3]
+    visible = in_camera[..., 2].min(axis=1) > 1e-3
+    pixels, by_point = project(np.where(visible[:, None, None], in_camera, [0.0, 0.0, 1.0]).reshape(-1, 3), intrinsics)
+    corners = pixels.reshape(-1, 4, 2)
+    by_position = (by_point @ world_from_camera[:3, :3].T).reshape(-1, 4, 2, 3)
+    by_pose = np.concatenate([by_position, _by_rotation(by_position, lever)], axis=-1)
+    if line_time:
+        motion = np.array([[*pose.velocity, *(R[k] @ pose.angular_velocity)] for k, (pose, _, _) in enumerate(known)])
+        rows = corners[..., 1].mean(axis=1)
+        corners = corners + line_time * rows[:, None, None] * np.einsum("mcai,mi->mca", by_pose, motion)
+    covariance = np.array([pose.covariance for pose, _, _ in known])
+    variance = np.einsum("mcai,mij,mcaj->mca", by_pose, covariance, by_pose)
+    sigma = np.sqrt(variance.max(axis=(1, 2)))
+    return {id: Prediction(corners[k], float(sigma[k])) for k, (_, id, _) in enumerate(known) if visible[k]}
 
 
 def solve_six(view: View, seen: Sequence[Seen]) -> list[tuple[Array, Array, float]]:
@@ -261,52 +325,112 @@ def solve_six(view: View, seen: Sequence[Seen]) -> list[tuple[Array, Array, floa
     return sorted(found, key=lambda item: item[2])
 
 
-def _planar(view: View, placement: Array) -> list[PoseHypothesis]:
-    start = _on_floor(view)
-    refined = None if start is None else view.refine(start, _PLANAR)
-    if refined is None:
-        return []
-    world_from_body, jacobian, misfit = refined
-    J = jacobian[:, _PLANAR]
-    noise = _covariance(J)
-    if noise is None:
-        return []
+# A step that lessens the misfit by no more, of which 1 is the sigma of a corner's coordinate, is the last.
+_GAIN = 1e-6
+
+
+def _planar(
+    seen: Sequence[tuple[Body, Sequence[MarkerSighting]]],
+    world_from_camera: Array,
+    intrinsics: Intrinsics,
+    placement: Array,
+) -> dict[str, list[PoseHypothesis]]:
+    """x, y and yaw of level bodies, all in one go: Gauss and Newton, from where rays meet the plane of the corners."""
+    points = np.vstack([body.corners[sighting.id] for body, markers in seen for sighting in markers])
+    corners = np.vstack([sighting.corners_px for _, markers in seen for sighting in markers])
+    sigma_px = np.repeat([sighting.sigma_px for _, markers in seen for sighting in markers], 4)
+    count = np.array([4 * len(markers) for _, markers in seen])
+    # Corners lie body after body: `of` is whose each is, `first` where those of each body begin.
+    of, first = np.repeat(np.arange(len(seen)), count), np.cumsum(count) - count
+    state, possible = _on_floor(points, corners, world_from_camera, intrinsics, of, first)
+    camera, R = world_from_camera[:3, 3], world_from_camera[:3, :3]
+    for _ in range(20):
+        lever = _turned(points, state[of, 2])
+        in_camera = (lever - camera) @ R + state[of, :2] @ R[:2]
+        possible &= np.minimum.reduceat(in_camera[:, 2], first) > 1e-3
+        expected, by_point = project(np.where(possible[of, None], in_camera, [0.0, 0.0, 1.0]), intrinsics)
+        by_position = by_point @ R.T
+        J = np.concatenate([by_position, _by_rotation(by_position, lever)], axis=2) / sigma_px[:, None, None]
+        residual = (corners - expected) / sigma_px[:, None]
+        normal = np.add.reduceat(J.transpose(0, 2, 1) @ J, first)
+        gradient = np.add.reduceat((residual[:, None] @ J)[:, 0], first)[:, _PLANAR]
+        misfit = np.add.reduceat(np.square(residual).sum(axis=1), first)
+        noise = np.linalg.inv(normal[:, _PLANAR][:, :, _PLANAR])
+        step = (noise @ gradient[..., None])[..., 0]
+        if not (((step * gradient).sum(axis=1) > _GAIN) & possible).any():
+            break
+        state = state + step
     # How the solved part answers to a motion of the body that the solve does not know of: dx = gain @ motion. Height
     # and tilt are errors of what was assumed ("consider" covariance), a misplaced camera is a motion of all six.
-    gain = noise @ J.T @ jacobian
-    assumed = np.zeros((6, 3))
-    assumed[_PLANAR] = gain[:, _ASSUMED]
-    assumed[_ASSUMED] = -np.eye(3)
-    moved = gain @ _body_by_placement(world_from_body, view.world_from_camera)
-    covariance = assumed @ _ASSUMED_COVARIANCE @ assumed.T
-    covariance[np.ix_(_PLANAR, _PLANAR)] += noise * _inflation(misfit, len(jacobian) - 3) + moved @ placement @ moved.T
-    return [_hypothesis(world_from_body, covariance, misfit)]
+    gain = noise @ normal[:, _PLANAR]
+    assumed = np.zeros((len(seen), 6, 3))
+    assumed[:, _PLANAR] = gain[:, :, _ASSUMED]
+    assumed[:, _ASSUMED] = -np.eye(3)
+    covariance = assumed @ _ASSUMED_COVARIANCE @ assumed.transpose(0, 2, 1)
+    hypotheses: dict[str, list[PoseHypothesis]] = {}
+    for k, (body, _) in enumerate(seen):
+        if not possible[k] or not np.isfinite(state[k]).all():
+            continue
+        x, y, yaw = state[k].tolist()
+        moved = gain[k] @ _body_by_placement(np.array([x, y, 0.0]), camera)
+        inflation = _inflation(float(misfit[k]), 2 * int(count[k]) - 3)
+        covariance[k][np.ix_(_PLANAR, _PLANAR)] += noise[k] * inflation + moved @ placement @ moved.T
+        quaternion = np.array([math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
+        hypotheses[body.name] = [PoseHypothesis(np.array([x, y, 0.0]), quaternion, covariance[k], float(misfit[k]))]
+    return hypotheses
 
 
 def _six(view: View, seen: Sequence[Seen], placement: Array) -> list[PoseHypothesis]:
     hypotheses = []
     for world_from_body, noise, misfit in solve_six(view, seen):
-        moved = _body_by_placement(world_from_body, view.world_from_camera)
+        moved = _body_by_placement(world_from_body[:3, 3], view.world_from_camera[:3, 3])
         covariance = noise * _inflation(misfit, 2 * len(view.points_body) - 6) + moved @ placement @ moved.T
         hypotheses.append(_hypothesis(world_from_body, covariance, misfit))
     return hypotheses
 
 
-def _on_floor(view: View) -> Array | None:
-    """world_from_body of a level body at z = 0: each corner's ray cut with the plane at that corner's height, then the
-    rotation and shift of the plane that fit best (Umeyama, 1991, without scale, in two dimensions)."""
-    directions = rays(view.corners_px, view.intrinsics) @ view.world_from_camera[:3, :3].T
-    camera = view.world_from_camera[:3, 3]
+def _on_floor(
+    points: Array,
+    corners_px: Array,
+    world_from_camera: Array,
+    intrinsics: Intrinsics,
+    of: NDArray[np.int_],
+    first: NDArray[np.int_],
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(m, 3) x, y and yaw of level bodies at z = 0, and for which there is one: each corner's ray cut with the plane at
+    that corner's height, then the rotation and shift of the plane that fit best (Umeyama, 1991, without scale, in two
+    dimensions)."""
+    directions = rays(corners_px, intrinsics) @ world_from_camera[:3, :3].T
+    camera = world_from_camera[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (view.points_body[:, 2] - camera[2]) / directions[:, 2]
-    if not np.isfinite(distance).all() or distance.min() <= 0.0:
-        return None
-    floor = camera[:2] + distance[:, None] * directions[:, :2]
-    body = view.points_body[:, :2]
-    a, b = body - body.mean(axis=0), floor - floor.mean(axis=0)
-    yaw = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-    R = rotation_about_z(yaw)
-    return transform(R, np.append(floor.mean(axis=0) - R[:2, :2] @ body.mean(axis=0), 0.0))
+        distance = (points[:, 2] - camera[2]) / directions[:, 2]
+    met = np.isfinite(distance) & (distance > 0.0)
+    floor = camera[:2] + np.where(met, distance, 0.0)[:, None] * directions[:, :2]
+    count = np.bincount(of)[:, None]
+    middle_floor, middle_body = (np.add.reduceat(p, first) / count for p in (floor, points[:, :2]))
+    a, b = points[:, :2] - middle_body[of], floor - middle_floor[of]
+    yaw = np.arctan2(
+        np.add.reduceat(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], first), np.add.reduceat((a * b).sum(axis=1), first)
+    )
+    middle = np.column_stack([middle_body, np.zeros(len(yaw))])
+    return np.column_stack([middle_floor - _turned(middle, yaw)[:, :2], yaw]), np.logical_and.reduceat(met, first)
+
+
+def _turned(points: Array, yaw: Array) -> Array:
+    """(n, 3) points, each turned about z by its own angle (n,)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = points.T
+    return np.column_stack([c * x - s * y, s * x + c * y, z])
+
+
+def _by_rotation(by_position: Array, lever: Array) -> Array:
+    """(..., 2, 3): how pixels answer to a rotation of a body, from how they do to a shift of a point of it (..., 2, 3).
+
+    `lever` (..., 3): from the body's origin to the point. d(p + exp(dtheta) x) / d dtheta = -[x]x, and -j [x]x = x × j.
+    """
+    x, y, z = np.moveaxis(lever[..., None, :], -1, 0)
+    a, b, c = np.moveaxis(by_position, -1, 0)
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
 def _covariance(jacobian: Array) -> Array | None:
@@ -323,10 +447,11 @@ def _inflation(misfit: float, degrees_of_freedom: int) -> float:
     return max(1.0, misfit / chi_square_limit(degrees_of_freedom))
 
 
-def _body_by_placement(world_from_body: Array, world_from_camera: Array) -> Array:
-    """(6, 6): how the body's pose moves with the camera's, both as position and rotation along world axes."""
+def _body_by_placement(body: Array, camera: Array) -> Array:
+    """(6, 6): how the pose of a body at a place (3,) moves with that of a camera at another, both as position and
+    rotation along world axes."""
     moved = np.eye(6)
-    moved[:3, 3:] = -skew(world_from_body[:3, 3] - world_from_camera[:3, 3])
+    moved[:3, 3:] = -skew(body - camera)
     return moved
 
 

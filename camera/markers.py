@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -92,29 +92,31 @@ def sample_image(image: Image, where: NDArray[np.float32], border: int) -> NDArr
 
 
 @dataclass(frozen=True, slots=True)
-class _Pass:
-    """One way to look for quadrilaterals: image scale, whether contrast is equalised first, threshold windows in px."""
+class Pass:
+    """One way to look for quadrilaterals: image scale, whether contrast is equalised first, threshold windows in px
+    (first, last, step), and by how much a pixel must be darker than its window to be black."""
 
     scale: float = 1.0
     equalise: bool = False
     windows: tuple[int, int, int] = (3, 23, 10)
+    darker: float = 7.0
 
 
 # The cheap ones first. One window is enough for a sharp, well-lit marker, half the resolution for one of 40 px or more.
 # A quarter finds large markers under strong blur, equalised contrast those in the dark, enlargement the small ones.
 _PASSES = (
-    _Pass(0.5, windows=(13, 13, 10)),
-    _Pass(windows=(13, 13, 10)),
-    _Pass(0.5, equalise=True, windows=(13, 13, 10)),
-    _Pass(0.25),
-    _Pass(),
-    _Pass(equalise=True),
-    _Pass(2.0, windows=(5, 45, 20)),
+    Pass(0.5, windows=(13, 13, 10)),
+    Pass(windows=(13, 13, 10)),
+    Pass(0.5, equalise=True, windows=(13, 13, 10)),
+    Pass(0.25),
+    Pass(),
+    Pass(equalise=True),
+    Pass(2.0, windows=(5, 45, 20)),
 )
 # Twofold enlargement is left out above this size: markers that are small there are none of a robot's. px
-_ENLARGE_UP_TO = 6_000_000
+ENLARGE_UP_TO = 6_000_000
 # Contours shorter than four times this are noise. px
-_SMALLEST_SIDE_PX = 6.0
+SMALLEST_SIDE_PX = 6.0
 
 # What a marker must reach. Chosen between 1 200 quadrilaterals around rendered markers (small, blurred, dark, moving,
 # tilted) and those that 45 photographs yield, compared with 10 dictionaries: every rendered marker that OpenCV reads is
@@ -135,8 +137,22 @@ _WORSE = 0.02
 # Standard deviation of the grey values inside
 _CONTRAST = 2.5
 
-# In a stream, frames between two full searches while a marker is missing
-_SEARCH_EVERY = 10
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A marker in a picture. `blur_px`: sigma of its edges' blur; `score`: correlation with what is printed;
+    `decoded`: whether it was told from all other markers of the dictionary."""
+
+    id: int
+    corners_px: Array
+    sigma_px: float
+    blur_px: float
+    score: float
+    decoded: bool = True
+
+
+# left, top, right, bottom, px; right and bottom are outside.
+Box = tuple[int, int, int, int]
 
 
 class MarkerDetector:
@@ -156,114 +172,102 @@ class MarkerDetector:
         self._decoder = _Decoder(self._dictionary)
         self._detector = cv2.aruco.ArucoDetector(self._dictionary, cv2.aruco.DetectorParameters())
         self._equaliser = cv2.createCLAHE(4.0, (8, 8))
-        self._ways: tuple[_Pass, ...] = ()
-        self._frames = 0
-        self._seen: frozenset[int] = frozenset()
 
     def search(self, image: Pixels, t: float = 0.0, camera: str = "") -> list[MarkerSighting]:
         """The markers of a single image, by id, with everything that can find one; `image` as in `grey`.
 
         With `ids` it stops as soon as each is found. A marker that is printed twice is returned twice.
         """
-        return self._sightings(self._search(grey(image), []), t, camera)
-
-    def detect(self, image: Pixels, t: float = 0.0, camera: str = "") -> list[MarkerSighting]:
-        """The markers of the next frame of a stream, by id; `image` as in `grey`.
-
-        Looks in the ways that were enough at the last search. Searches again when a marker has just been lost, and now
-        and then while one of `ids` is missing (without `ids`: always, something new may have appeared).
-        """
         picture = grey(image)
-        due = self._frames % _SEARCH_EVERY == 0
-        self._frames += 1
-        found: list[_Found] = []
-        for way in self._ways:
-            found = _distinct(found + self._look(picture, way))
-            if self._complete(found):
-                break
-        if not self._complete(found) and (due or not self._seen <= {marker.id for marker in found}):
-            found = self._search(picture, found)
-        self._seen = frozenset(marker.id for marker in found)
-        return self._sightings(found, t, camera)
-
-    def _search(self, picture: Image, found: list[_Found]) -> list[_Found]:
-        by_way: dict[_Pass, set[int]] = {}
+        found: list[Found] = []
         for way in _PASSES:
-            if way.scale > 1.0 and picture.size > _ENLARGE_UP_TO:
+            if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
-            if min(picture.shape) * way.scale < 1.0:
-                continue
-            new = self._look(picture, way)
-            by_way[way] = {marker.id for marker in new}
-            found = _distinct(found + new)
-            if self._complete(found):
+            found = distinct(found + self.look(picture, way))
+            if self.ids is not None and self.ids <= {marker.id for marker in found}:
                 break
-        # The way that found most, and those that found what it did not.
-        best = max(by_way, key=lambda way: len(by_way[way]))
-        covered = set(by_way[best])
-        ways = [best]
-        for way, ids in by_way.items():
-            if not ids <= covered:
-                ways.append(way)
-                covered |= ids
-        self._ways = tuple(ways)
-        return found
-
-    def _complete(self, found: list[_Found]) -> bool:
-        return self.ids is not None and self.ids <= {marker.id for marker in found}
-
-    def _look(self, picture: Image, way: _Pass) -> list[_Found]:
-        """What one pass finds."""
-        image = np.asarray(self._equaliser.apply(picture), np.uint8) if way.equalise else picture
-        if way.scale != 1.0:
-            kind = cv2.INTER_CUBIC if way.scale > 1.0 else cv2.INTER_AREA
-            image = np.asarray(cv2.resize(image, None, fx=way.scale, fy=way.scale, interpolation=kind), np.uint8)
-        parameters = self._detector.getDetectorParameters()
-        smallest = _SMALLEST_SIDE_PX * max(1.0, way.scale)
-        parameters.minMarkerPerimeterRate = 4.0 * smallest / max(image.shape)
-        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax, _ = way.windows
-        parameters.adaptiveThreshWinSizeStep = way.windows[2]
-        self._detector.setDetectorParameters(parameters)
-        decoded, _, others = self._detector.detectMarkers(image)
-        if not decoded and not others:
-            return []
-        quads = np.array([*decoded, *others], np.float64).reshape(-1, 4, 2)
-        by_opencv = np.arange(len(quads)) < len(decoded)
-        # Middles of pixels are at whole numbers, and a scaled image's edges, not its middles, coincide.
-        found = self._decoder.read(picture, (quads + 0.5) / way.scale - 0.5, by_opencv)
-        return [marker for marker in found if self.ids is None or marker.id in self.ids]
-
-    def _sightings(self, found: list[_Found], t: float, camera: str) -> list[MarkerSighting]:
         return [
             MarkerSighting(t, camera, marker.id, marker.corners_px, marker.sigma_px)
             for marker in sorted(found, key=lambda marker: marker.id)
         ]
 
+    def look(
+        self,
+        picture: Image,
+        way: Pass,
+        sides_px: tuple[float, float] = (SMALLEST_SIDE_PX, math.inf),
+        boxes: Sequence[Box] | None = None,
+    ) -> list[Found]:
+        """What one pass finds, in the whole picture or in some boxes of it, of markers whose sides are about so long.
 
-@dataclass(frozen=True, slots=True)
-class _Found:
-    id: int
-    corners_px: Array
-    sigma_px: float
-    score: float
+        The narrower the bounds, the fewer contours there are to follow: half of the time goes there.
+        """
+        height, width = picture.shape
+        quads: list[Array] = []
+        by_opencv: list[bool] = []
+        parameters = self._detector.getDetectorParameters()
+        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax, _ = way.windows
+        parameters.adaptiveThreshWinSizeStep = way.windows[2]
+        parameters.adaptiveThreshConstant = way.darker
+        for left, top, right, bottom in ((0, 0, width, height),) if boxes is None else boxes:
+            image: Image = picture[top:bottom, left:right]
+            if min(image.shape) * way.scale < 1.0:
+                continue
+            if way.equalise:
+                image = np.asarray(self._equaliser.apply(image), np.uint8)
+            if way.scale != 1.0:
+                kind = cv2.INTER_CUBIC if way.scale > 1.0 else cv2.INTER_AREA
+                image = np.asarray(cv2.resize(image, None, fx=way.scale, fy=way.scale, interpolation=kind), np.uint8)
+            shortest = max(sides_px[0] * way.scale, SMALLEST_SIDE_PX)
+            # OpenCV counts a contour's pixels, of which a slanted side has fewer than its length.
+            parameters.minMarkerPerimeterRate = _SLANTED * 4.0 * shortest / max(image.shape)
+            parameters.maxMarkerPerimeterRate = min(4.0 * sides_px[1] * way.scale / max(image.shape), 4.0)
+            self._detector.setDetectorParameters(parameters)
+            decoded, _, others = self._detector.detectMarkers(image)
+            if decoded or others:
+                # Middles of pixels are at whole numbers, and a scaled image's edges, not its middles, coincide.
+                here = (np.array([*decoded, *others], np.float64).reshape(-1, 4, 2) + 0.5) / way.scale - 0.5
+                quads.append(here + np.array([left, top]))
+                by_opencv += [True] * len(decoded) + [False] * len(others)
+        if not quads:
+            return []
+        found = self._decoder.read(picture, np.vstack(quads), np.array(by_opencv))
+        return [marker for marker in found if self.ids is None or marker.id in self.ids]
+
+    def follow(
+        self, picture: Image, ids: Sequence[int], corners_px: Array, reach_px: Array, decode: NDArray[np.bool_]
+    ) -> list[Found | None]:
+        """The markers `ids` (n) at places that are already nearly known, corners (n, 4, 2), None for one not there.
+
+        `reach_px` (n,) as in `refine_corners`. No quadrilateral is looked for; what is there must look like that very
+        marker. `decode` (n,): which are also compared with all others, so that none goes by another's name for long.
+        """
+        return self._decoder.follow(picture, ids, corners_px, reach_px, decode)
 
 
-def _distinct(found: list[_Found]) -> list[_Found]:
+# A contour at 45 degrees has one pixel for each step of the square root of two.
+_SLANTED = 0.7
+
+
+def distinct(found: Collection[Found]) -> list[Found]:
     """Of several that lie on each other the one with the sharper corners, then the better likeness."""
-    kept: list[_Found] = []
-    for marker in sorted(found, key=lambda marker: (marker.sigma_px, -marker.score)):
-        middle = marker.corners_px.mean(axis=0)
-        apart = 0.5 * float(_shortest_sides(marker.corners_px[None])[0])
-        if all(np.hypot(*(middle - other.corners_px.mean(axis=0))) > apart for other in kept):
-            kept.append(marker)
-    return kept
+    if len(found) < 2:
+        return list(found)
+    ordered = sorted(found, key=lambda marker: (marker.sigma_px, -marker.score))
+    corners = np.array([marker.corners_px for marker in ordered])
+    middles = corners.mean(axis=1)
+    apart = np.hypot(*np.moveaxis(middles[:, None] - middles, -1, 0)) > 0.5 * _shortest_sides(corners)[:, None]
+    kept: list[int] = []
+    for k in range(len(ordered)):
+        if apart[k, kept].all():
+            kept.append(k)
+    return [ordered[k] for k in kept]
 
 
-def _shortest_sides(quads: Array) -> Array:
+def _shortest_sides(quads: NDArray[np.floating]) -> NDArray[np.floating]:
     """(n, 4, 2) -> (n,) px"""
-    sides = quads[:, [1, 2, 3, 0]] - quads
-    shortest: Array = np.sqrt(np.square(sides).sum(axis=-1)).min(axis=1)
-    return shortest
+    squares = np.square(quads[:, [1, 2, 3, 0]] - quads)
+    return np.asarray(np.sqrt((squares[..., 0] + squares[..., 1]).min(axis=1)))
 
 
 # Samples per cell and axis
@@ -295,16 +299,16 @@ class _Decoder:
             shape = (-1, self.cells, _PER_CELL, self.cells, _PER_CELL)
             cells = fine.reshape(shape).mean(axis=(2, 4))
             turned = np.stack([np.rot90(cells, turn, axes=(1, 2)) for turn in range(4)], axis=1)
-            templates.append(_normalised(turned.reshape(len(cells), 4, -1)))
+            templates.append(_normalised(turned.reshape(len(cells), 4, -1).astype(np.float32)))
         # By marker, made when it is first seen: (blur, sample)
-        self._pictures: dict[int, NDArray[np.floating]] = {}
+        self._pictures: dict[int, NDArray[np.float32]] = {}
         # (blur, marker, turn, cell)
         self._templates = np.array(templates, np.float32)
         middles = (np.arange(self.cells * _PER_CELL) + 0.5) / (self.cells * _PER_CELL)
         x, y = np.meshgrid(middles, middles)
         self._places = np.stack([x, y], axis=-1).reshape(1, -1, 2)
 
-    def read(self, image: Image, quads: Array, decoded: NDArray[np.bool_]) -> list[_Found]:
+    def read(self, image: Image, quads: Array, decoded: NDArray[np.bool_]) -> list[Found]:
         """The markers among quadrilaterals (n, 4, 2) px, each place at most once. `decoded` (n,): those that OpenCV
         could read, of which less is demanded."""
         # A rough look first: measuring corners costs more, and most of what a textured floor yields is no marker.
@@ -315,19 +319,47 @@ class _Decoder:
         if not worth.any():
             return []
         quads, decoded, rough = quads[worth], decoded[worth], rough[worth]
-        corners, sigma = refine_corners(image, quads, self.cells)
+        corners, sigma, blur = refine_corners(image, quads, self.cells)
         samples = self._samples(image, corners)
         marker, turn, ahead, likeness = self._best(samples)
+        like = np.flatnonzero((likeness >= _CELLS) & (ahead <= _AHEAD) & (samples.std(axis=(1, 2)) >= _CONTRAST))
+        if not like.size:
+            return []
+        upright = [np.rot90(picture[k], -turn[k]) for picture in (samples, rough) for k in like]
+        scores = self._likeness(np.array(upright), marker[like].tolist() * 2).reshape(2, -1)
         found = []
-        for k in np.flatnonzero((likeness >= _CELLS) & (ahead <= _AHEAD) & (samples.std(axis=(1, 2)) >= _CONTRAST)):
+        for k, score, before in zip(like.tolist(), *scores.tolist(), strict=True):
             at, sigma_px = corners[k], float(sigma[k])
-            score, before = (self._likeness(picture[k], marker[k], turn[k]) for picture in (samples, rough))
             # Corners that fit the picture worse than those before were measured on something else than the edges.
             if before > score + _WORSE:
                 at, sigma_px, score = quads[k], max(sigma_px, SIGMA_UNREFINED_PX), before
             if score >= (_PICTURE if decoded[k] or sigma_px < SIGMA_UNREFINED_PX else _PICTURE_UNCLEAR):
-                found.append(_Found(int(marker[k]), np.roll(at, turn[k], axis=0), sigma_px, score))
-        return _distinct(found)
+                at = at[[(i - turn[k]) % 4 for i in range(4)]]
+                found.append(Found(int(marker[k]), at, sigma_px, float(blur[k]), score))
+        return distinct(found)
+
+    def follow(
+        self, image: Image, ids: Sequence[int], quads: Array, reach_px: Array, decode: NDArray[np.bool_]
+    ) -> list[Found | None]:
+        """See MarkerDetector."""
+        corners, sigma, blur = refine_corners(image, quads, self.cells, reach_px)
+        samples = self._samples(image, corners)
+        score = self._likeness(samples, ids)
+        # Without clear edges there is nothing new: the corners would be those that were predicted.
+        there = (score >= _PICTURE) & (sigma < SIGMA_UNREFINED_PX) & (samples.std(axis=(1, 2)) >= _CONTRAST)
+        decoded = np.zeros(len(ids), np.bool_)
+        if (compare := np.flatnonzero(decode & there)).size:
+            marker, turn, ahead, likeness = self._best(samples[compare])
+            itself = (marker == np.array(ids)[compare]) & (turn == 0)
+            sure = (likeness >= _CELLS) & (ahead <= _AHEAD)
+            decoded[compare] = itself & sure
+            there[compare] &= itself | ~sure
+        return [
+            Found(ids[k], corners[k], float(sigma[k]), float(blur[k]), float(score[k]), bool(decoded[k]))
+            if there[k]
+            else None
+            for k in range(len(ids))
+        ]
 
     def _samples(self, image: Image, quads: Array) -> NDArray[np.float32]:
         """(n, rows, columns) grey values inside each quadrilateral, seen straight on."""
@@ -361,20 +393,22 @@ class _Decoder:
         by_marker[every, marker] = 0.0
         return marker, turn, (1.0 - best) / np.maximum(1.0 - by_marker.max(axis=1), 1e-9), best
 
-    def _likeness(self, samples: NDArray[np.float32], marker: int, turn: int) -> float:
-        """Correlation of all samples with one marker, at the blur that suits best."""
-        if marker not in self._pictures:
-            code = self._codes[marker]
+    def _likeness(self, samples: NDArray[np.float32], ids: Sequence[int]) -> NDArray[np.float32]:
+        """(n,) correlation of all samples of each with its marker, upright, at the blur that suits best."""
+        for id in set(ids) - self._pictures.keys():
+            code = self._codes[id]
             pictures = np.array([(blur @ code @ blur.T).ravel() for blur in self._blurs])
-            self._pictures[marker] = _normalised(pictures.astype(np.float32))
-        upright = np.rot90(samples, -turn).reshape(1, -1)
-        return float((self._pictures[marker] * _normalised(upright)).sum(axis=1).max())
+            self._pictures[id] = _normalised(pictures.astype(np.float32))
+        pictures = np.array([self._pictures[id] for id in ids])
+        seen = _normalised(samples.reshape(len(ids), 1, -1))
+        return np.asarray((pictures * seen).sum(axis=2).max(axis=1), np.float32)
 
 
-def _normalised(values: NDArray[np.floating]) -> NDArray[np.floating]:
+def _normalised(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Without mean and with length 1 along the last axis, so that a scalar product is a correlation."""
     centred = values - values.mean(axis=-1, keepdims=True)
-    return np.asarray(centred / np.maximum(np.linalg.norm(centred, axis=-1, keepdims=True), 1e-6))
+    length = np.sqrt(np.square(centred).sum(axis=-1, keepdims=True))
+    return np.asarray(centred / np.maximum(length, 1e-6), np.float32)
 
 
 def _blur(cells: int, sigma: float) -> Array:
@@ -388,86 +422,117 @@ def _blur(cells: int, sigma: float) -> Array:
 
 
 # Edge refinement: profiles per leg, samples per profile. A leg is the part of a side next to a corner.
-_PROFILES, _SAMPLES = 18, 21
+_PROFILES, _SAMPLES = 12, 15
 # A leg begins this part of the side away from the corner, where the other leg's edge is out of the blur, ...
 _GAP, _GAP_PX = 0.08, 4.0
 # ... and is no longer than this, so that neither a lens nor wavy paper bends it: the rest of a long side says nothing
 # about its corner. px
 _LEG_PX = 36.0
+_ALONG = np.linspace(0.0, 1.0, _PROFILES, dtype=np.float32)
+_ACROSS = np.linspace(-1.0, 1.0, _SAMPLES, dtype=np.float32)
+# By corner, the corners where its two legs lead.
+_ENDS = np.array([[1, 3], [2, 0], [3, 1], [0, 2]])
+# Per leg: a leg's direction with x and y swapped, times this, points out of the square.
+_OUTWARD = np.array([[1.0, -1.0], [-1.0, 1.0]], np.float32)
+# How often the lines through the edges are fitted, each time with the weights that the last fit's residuals give.
+_ROUNDS = 3
+# A profile's rises times this are their sum and their first two moments about the profile's middle, ...
+_BETWEEN = 0.5 * (_ACROSS[1:] + _ACROSS[:-1])
+_MOMENTS = np.stack([np.ones_like(_BETWEEN), _BETWEEN, np.square(_BETWEEN)], axis=1)
+# ... and a profile times this is by how much its outer fifth is brighter than its inner one.
+_CONTRAST_ACROSS = np.where(np.abs(_ACROSS) > 0.6, np.sign(_ACROSS) / (_SAMPLES // 5), 0.0).astype(np.float32)[:, None]
 
 
-def refine_corners(image: Image, corners_px: Array, cells: int) -> tuple[Array, Array]:
-    """Measures corners on the edges of the black square. (n, 4, 2) px, clockwise -> (n, 4, 2) px and (n,) sigma, px.
+def refine_corners(
+    image: Image, corners_px: Array, cells: int, reach_px: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Measures corners on the edges of the black square.
 
-    `cells`: of a marker's side, its black border included. A marker whose sides do not show a clear edge from black to
-    white, or whose corners would move further than the profiles reach, keeps the corners it came with and
-    SIGMA_UNREFINED_PX.
+    (n, 4, 2) px, clockwise -> (n, 4, 2) px, (n,) sigma and (n,) sigma of the edges' blur, px. `cells`: of a marker's
+    side, its black border included. `reach_px` (n,): how far the corners may be off and the edge be blurred together,
+    where that is known. A marker whose sides do not show a clear edge from black to white, or whose corners would move
+    further than the profiles reach, keeps the corners it came with and SIGMA_UNREFINED_PX.
     """
-    start = np.asarray(corners_px, dtype=np.float64)
+    start = np.asarray(corners_px, dtype=np.float32)
     cell = np.maximum(_shortest_sides(start) / cells, 1e-9)
     # Half a profile stays within the black border inside and the white margin outside, each a cell wide.
-    reach = np.maximum(0.8 * cell, 1.5)
-    corners, _, blur, clear = _refine_once(image, start, reach)
+    furthest = np.maximum(0.8 * cell, 1.5)
+    reach = furthest if reach_px is None else np.minimum(np.maximum(reach_px, 1.5), furthest).astype(np.float32)
+    corners, noise, blur, clear = _refine_once(image, start, reach)
+    corners = np.where(clear[:, None, None], corners, start)
     # Again: the detector's corners may be off by pixels, and a profile that is not centred pulls its edge to its own
     # middle. Three sigma of the edge's own blur hold all of it, and a shorter profile is sampled more finely.
-    shorter = np.clip(3.0 * blur.max(axis=1), 1.5, 0.75 * reach + 0.4)
-    corners, noise, blur, still_clear = _refine_once(image, corners, shorter)
-    clear &= still_clear & (np.linalg.norm(corners - start, axis=2).max(axis=1) <= np.maximum(reach, 2.0))
+    shorter = np.clip(3.0 * blur.max(axis=1), 1.5, 0.75 * furthest + 0.4)
+    shift = _furthest(corners - start)
+    again = np.flatnonzero((shift > 0.3 * reach) | (np.abs(shorter - reach) > 0.5 * reach))
+    if again.size:
+        corners[again], noise[again], blur[again], still_clear = _refine_once(image, corners[again], shorter[again])
+        clear[again] &= still_clear
+    clear &= _furthest(corners - start) <= np.maximum(furthest, 2.0)
     # Blur brings the next cells' edges into the profile: on rendered markers of 13 to 70 px under blur of 0.5 to 5 px
     # the corners' error is what the edges' width exceeds this part of a cell by.
     crowding = np.maximum(blur - 0.185 * cell[:, None], 0.0)
     sigma = np.sqrt(SIGMA_FLOOR_PX**2 + noise**2 + np.square(crowding).mean(axis=1))
     sigma = np.where(clear, sigma, np.maximum(sigma, SIGMA_UNREFINED_PX))
-    return np.where(clear[:, None, None], corners, start), sigma
+    refined: Array = np.where(clear[:, None, None], corners, np.asarray(corners_px, np.float64))
+    return refined, sigma.astype(np.float64), blur.max(axis=1).astype(np.float64)
 
 
-def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+def _furthest(shift: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(n,) length of the longest of each four (n, 4, 2)."""
+    squares = np.square(shift)
+    return np.asarray(np.sqrt((squares[..., 0] + squares[..., 1]).max(axis=1)))
+
+
+def _refine_once(
+    image: Image, corners: NDArray[np.float32], reach: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """(n, 4, 2) corners, (n,) their sigma by the edges' scatter, (n, 8) sigma of the blur of each leg's edge, and
     whether every leg had enough clear edges. `reach` (n,): half of a profile's length, px."""
     n = len(corners)
     # Two legs from each corner: to the next corner and to the one before. (n, 4, 2 legs, xy)
-    leg = np.stack([corners[:, [1, 2, 3, 0]], corners[:, [3, 0, 1, 2]]], axis=2) - corners[:, :, None]
-    length = np.maximum(np.linalg.norm(leg, axis=-1), 1e-9)
+    leg = corners[:, _ENDS] - corners[:, :, None]
+    length = np.maximum(np.hypot(leg[..., 0], leg[..., 1]), 1e-6)
     along = leg / length[..., None]
     # Out of the square, whose corners run clockwise in an image with y down: left of the one leg, right of the other.
-    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1) * np.array([1.0, -1.0])[:, None]
+    outward = along[..., ::-1] * _OUTWARD
 
     gap = np.minimum(_GAP * length, np.maximum(_GAP_PX, 0.7 * reach)[:, None, None])
-    u = gap[..., None] + np.minimum(length - 2.0 * gap, _LEG_PX)[..., None] * np.linspace(0.0, 1.0, _PROFILES)
-    across = np.linspace(-1.0, 1.0, _SAMPLES)
+    u = gap[..., None] + np.minimum(length - 2.0 * gap, _LEG_PX)[..., None] * _ALONG
     on_leg = corners[:, :, None, None] + u[..., None] * along[..., None, :]
-    off_leg = (reach[:, None] * across)[:, None, None, None, :, None] * outward[..., None, None, :]
-    where = (on_leg[..., None, :] + off_leg).astype(np.float32)
-    profile = sample_image(image, where.reshape(n * 8, _PROFILES * _SAMPLES, 2), cv2.BORDER_REPLICATE)
-    profile = profile.reshape(n, 4, 2, _PROFILES, _SAMPLES).astype(np.float32)
+    off_leg = (reach[:, None] * _ACROSS)[:, None, None, :, None] * outward[..., None, :]
+    where = on_leg[..., None, :] + off_leg[:, :, :, None]
+    values = sample_image(image, where.reshape(n * 8, _PROFILES * _SAMPLES, 2), cv2.BORDER_REPLICATE)
+    profile = values.reshape(-1, _SAMPLES).astype(np.float32)
 
     # The edge is the middle of the gradient. Only what grows brighter outwards and stands out counts: the rest is
     # noise, and would pull the edge to the middle of the profile.
-    rise = np.maximum(np.diff(profile, axis=-1), 0.0)
-    rise = np.maximum(rise - 0.15 * rise.max(axis=-1, keepdims=True), 0.0)
-    between = 0.5 * (across[1:] + across[:-1])
-    total = np.maximum(rise.sum(axis=-1), 1e-9)
-    edge = np.einsum("nijks,s->nijk", rise, between) / total
-    spread = np.sqrt(np.maximum(np.einsum("nijks,s->nijk", rise, between**2) / total - edge**2, 0.0))
-    edge *= reach[:, None, None, None]
-    blur = np.median(spread, axis=-1).reshape(n, 8) * reach[:, None]
-    fifth = _SAMPLES // 5
-    contrast = profile[..., -fifth:].mean(axis=-1) - profile[..., :fifth].mean(axis=-1)
-    valid = (contrast > 0.4 * np.median(contrast, axis=(1, 2, 3), keepdims=True)) & (contrast > 2.0)
+    rise = profile[:, 1:] - profile[:, :-1]
+    rise -= np.maximum(0.15 * rise.max(axis=1, keepdims=True), 0.0)
+    moments = _product(np.maximum(rise, 0.0), _MOMENTS)
+    total = np.maximum(moments[:, 0], 1e-6)
+    middle = moments[:, 1] / total
+    spread = np.sqrt(np.maximum(moments[:, 2] / total - np.square(middle), 0.0))
+    edge = middle.reshape(n, 4, 2, _PROFILES) * reach[:, None, None, None]
+    blur = np.partition(spread.reshape(n, 8, _PROFILES), _PROFILES // 2, axis=-1)[..., _PROFILES // 2] * reach[:, None]
+    contrast = _product(profile, _CONTRAST_ACROSS).reshape(n, -1)
+    usual = np.partition(contrast, contrast.shape[1] // 2, axis=1)[:, contrast.shape[1] // 2]
+    valid = (contrast > np.maximum(0.4 * usual, 2.0)[:, None]).reshape(edge.shape)
 
     # edge = offset + slope u along each leg, by least squares reweighted with Tukey's biweight
-    weight = valid.astype(np.float64)
-    for _ in range(4):
-        wu = weight * u
-        s0, s1, s2 = weight.sum(axis=-1), wu.sum(axis=-1), (wu * u).sum(axis=-1)
-        t0, t1 = (weight * edge).sum(axis=-1), (wu * edge).sum(axis=-1)
-        determinant = s0 * s2 - s1 * s1 + 1e-9
+    weight = valid.astype(np.float32)
+    terms = np.empty((5, *edge.shape), np.float32)
+    powers = np.stack([np.ones_like(u), u, np.square(u), edge, u * edge])
+    for _ in range(_ROUNDS):
+        np.multiply(weight, powers, out=terms)
+        s0, s1, s2, t0, t1 = terms.sum(axis=-1)
+        determinant = np.maximum(s0 * s2 - s1 * s1, 1e-3)
         offset, slope = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
         residual = edge - offset[..., None] - slope[..., None] * u
         scale = 4.685 * np.maximum(1.4826 * _median_where(np.abs(residual), valid), 0.03)
         weight = valid * np.square(np.maximum(1.0 - np.square(residual / scale[:, None, None, None]), 0.0))
     support = weight.sum(axis=-1)
-    variance = (weight * residual**2).sum(axis=(1, 2, 3)) / np.maximum(support.sum(axis=(1, 2)), 1e-9)
+    variance = (weight * np.square(residual)).sum(axis=(1, 2, 3)) / np.maximum(support.sum(axis=(1, 2)), 1e-6)
     # Variance of a leg's offset at the corner over that of a profile; profiles within a pixel see the same noise.
     at_corner = s2 / determinant * np.maximum(1.0, _PROFILES / np.minimum(length, _LEG_PX))
     sigma = np.sqrt(variance * at_corner.mean(axis=(1, 2)))
@@ -475,14 +540,19 @@ def _refine_once(image: Image, corners: Array, reach: Array) -> tuple[Array, Arr
     # Where the lines of the two legs meet
     on_line = corners[:, :, None] + offset[..., None] * outward
     direction = along + slope[..., None] * outward
-    (p, q), (v, w) = np.moveaxis(on_line, 2, 0), np.moveaxis(direction, 2, 0)
+    p, v, w = on_line[:, :, 0], direction[:, :, 0], direction[:, :, 1]
+    across = on_line[:, :, 1] - p
     cross = v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]
-    between_lines = (q - p)[..., 0] * w[..., 1] - (q - p)[..., 1] * w[..., 0]
-    met = p + (between_lines / np.where(np.abs(cross) < 1e-9, 1e-9, cross))[..., None] * v
-    return met, sigma, blur, (support > 0.4 * _PROFILES).all(axis=(1, 2))
+    part = (across[..., 0] * w[..., 1] - across[..., 1] * w[..., 0]) / np.where(np.abs(cross) < 1e-6, 1e-6, cross)
+    return p + part[..., None] * v, sigma, blur, (support > 0.4 * _PROFILES).all(axis=(1, 2))
 
 
-def _median_where(values: Array, valid: NDArray[np.bool_]) -> Array:
+def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """a @ b. Not numpy's product: its BLAS wakes threads, which on a busy machine cost more than they bring."""
+    return np.asarray(cv2.gemm(a, b, 1.0, None, 0.0), np.float32)  # type: ignore[call-overload]
+
+
+def _median_where(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """(n,) median over all but the first axis of the valid values; 0 where there is none."""
     ordered = np.sort(np.where(valid, values, np.inf).reshape(len(values), -1), axis=1)
     count = valid.reshape(len(values), -1).sum(axis=1)

@@ -7,6 +7,7 @@ Paths: WebSocket `/` (the original tracker's stream), `/v1/poses`, `/v1/robot`; 
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import errno
 import functools
@@ -87,6 +88,8 @@ HELLO_TIMEOUT = 10.0
 CLOCK_FAST, CLOCK_FAST_COUNT, CLOCK_SLOW = 0.1, 10, 1.0
 # s between two diagnoses of each robot: one takes about 2 ms.
 DIAGNOSE_EVERY = 5.0
+# s that a camera waits for the filters' word; without it, it looks where the markers were last.
+POSES_TIMEOUT = 0.05
 # s that closing may take: for clients that do not answer, and for threads that hang in a driver.
 CLOSE_TIMEOUT = 0.7
 
@@ -259,7 +262,7 @@ class Service:
 
         if config.source == "remote":
             return RemoteCamera(config, self.config, self._deliver, wanted)
-        return Camera(config, self.config, self._deliver, wanted, open_camera)
+        return Camera(config, self.config, self._deliver, wanted, open_camera, self._poses_at)
 
     def _say_who_is_let_in(self, host: str) -> None:
         server = self.config.server
@@ -318,6 +321,21 @@ class Service:
     def _deliver(self, seen: Seen) -> None:
         """From a camera's thread."""
         self._call_from_thread(self._seen, seen)
+
+    def _poses_at(self, t: float) -> dict[str, Pose]:
+        """From a camera's thread: where the robots were at `t`, as far as their filters, which are the loop's, know."""
+        answer: concurrent.futures.Future[dict[str, Pose]] = concurrent.futures.Future()
+
+        def look() -> None:
+            robots = self.robots if self.ready.is_set() else {}
+            poses = {name: robot.localiser.pose_at(t) for name, robot in robots.items()}
+            answer.set_result({name: pose for name, pose in poses.items() if pose is not None})
+
+        self._call_from_thread(look)
+        try:
+            return answer.result(POSES_TIMEOUT)
+        except TimeoutError:
+            return {}
 
     def _call_from_thread(self, function: Callable[..., None], *arguments: object) -> None:
         # The loop may be closed while a thread still ends: nobody needs what it brings then.

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,11 +17,13 @@ import numpy as np
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import Delivery, DeliveryMeter, advice, black
-from camera.fix import MarkerMount, marker_poses, rays, solve
+from camera.fix import Body, MarkerMount, marker_poses, predict, rays, solve
 from camera.floor import Anchor, Placement, PlacementError, load_placement, locate_camera
-from camera.markers import MarkerDetector, MarkerSighting
+from camera.markers import MarkerSighting
+from camera.shake import measure_shake, shaken
+from camera.tracking import MarkerTracker
 from fusion.geometry import log_so3, rotation_about_z, transform
-from fusion.measurements import Array, PoseFix
+from fusion.measurements import Array, Pose, PoseFix
 from server.config import AnchorConfig, CameraConfig, Config, ConfigError, MarkerConfig
 from server.messages import tracker_message
 
@@ -91,8 +93,9 @@ class Camera:
     """Opens its source, and again whenever that is lost, until `stop`.
 
     `deliver` is called from the camera's thread, once a frame; `tracker_wanted` tells there whether anyone listens to
-    the original stream, whose poses are not free. `status` says in words what keeps the camera from its work, and is
-    "" where nothing does. Raises ConfigError, CalibrationError or OSError for what cannot ever work.
+    the original stream, whose poses are not free, and `poses_at` says where the robots were at an instant, by name, as
+    far as their filters know. `status` says in words what keeps the camera from its work, and is "" where nothing does.
+    Raises ConfigError, CalibrationError or OSError for what cannot ever work.
     """
 
     def __init__(
@@ -102,6 +105,7 @@ class Camera:
         deliver: Callable[[Seen], None],
         tracker_wanted: Callable[[], bool] = lambda: False,
         open: Open = open_configured,
+        poses_at: Callable[[float], Mapping[str, Pose]] = lambda t: {},
     ) -> None:
         self.config = config
         self.status = "is being opened"
@@ -114,6 +118,7 @@ class Camera:
         self._deliver = deliver
         self._tracker_wanted = tracker_wanted
         self._open = open
+        self._poses_at = poses_at
         if not Path(config.calibration).is_file():
             raise CalibrationError(
                 f'camera "{config.name}": there is no calibration file {config.calibration}. It holds the camera '
@@ -130,14 +135,15 @@ class Camera:
             self.placement, self.unlocated = load_placement(config.placement), ""
         self._anchors = [_anchor(anchor) for anchor in room.anchor]
         self.anchor_ids = {anchor.id for anchor in room.anchor}
-        self._robots = [
-            (robot.name, [_mount(marker) for marker in robot.marker], robot.motion != "free") for robot in room.robot
+        self._bodies = [
+            Body(robot.name, [_mount(marker) for marker in robot.marker], planar=robot.motion != "free")
+            for robot in room.robot
         ]
         self._sizes = {marker.id: marker.size for marker in self._anchors}
-        self._sizes |= {mount.id: mount.size for _, mounts, _ in self._robots for mount in mounts}
+        self._sizes |= {mount.id: mount.size for body in self._bodies for mount in body.mounts.values()}
         self.ids = frozenset(self._sizes)
         try:
-            self._detector = MarkerDetector(config.dictionary, ids=self.ids)
+            self._tracking = MarkerTracker(config.dictionary, self.ids, still=self.anchor_ids)
         except ValueError as error:
             raise ConfigError(f'camera "{config.name}": {error}') from None
         self._image_size = (0, 0)
@@ -148,6 +154,8 @@ class Camera:
         self._next_look = -math.inf
         self._settled = self.placement is not None
         self._moved = False
+        # The anchors' corners while the camera hangs as it was found to, px, by id.
+        self._at_rest: dict[int, Array] = {}
         self._arrivals: deque[float] = deque()
         self._source: Source | None = None
         self._stop = threading.Event()
@@ -220,7 +228,7 @@ class Camera:
         else:
             self._take_size(frame.image.shape[1], frame.image.shape[0])
             self._meter.add(frame, arrival)
-            sightings = self._detector.detect(frame.image, frame.t + self.config.time_offset, self.config.name)
+            sightings = self._track(frame)
             self.detect_ms = (time.monotonic() - arrival) * 1e3
         self.frames += 1
         self.last_frame = arrival
@@ -234,6 +242,14 @@ class Camera:
             fixes=tuple(self._fixes(sightings, arrival)),
             tracker=tuple(self._tracker(sightings)) if self._tracker_wanted() else (),
         )
+
+    def _track(self, frame: Frame) -> list[MarkerSighting]:
+        t = frame.t + self.config.time_offset
+        predictions = {}
+        if (placement := self.placement) is not None:
+            poses = self._poses_at(t)
+            predictions = predict(self._bodies, poses, self.intrinsics, placement.world_from_camera, frame.line_time)
+        return self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
 
     def _take_size(self, width_px: int, height_px: int) -> None:
         self.intrinsics.check_size(width_px, height_px)
@@ -254,44 +270,46 @@ class Camera:
             self._looks.clear()
             self._next_look = now + PLACEMENT_CHECK
         try:
-            found = locate_camera(_averaged(looks), self._anchors, self.intrinsics)
+            averaged = _averaged(looks)
+            found = locate_camera(averaged, self._anchors, self.intrinsics)
         except PlacementError as error:
             if str(error) != self.unlocated:
                 log.warning("camera %s: %s", self.config.name, error)
             self.unlocated = str(error)
             return
         self.unlocated = ""
+        at_rest = {sighting.id: sighting.corners_px for sighting in averaged}
         if not self._settled:
             if self.placement is None:
                 height = float(found.world_from_camera[2, 3])
                 log.info("camera %s is located, %.2f m above the floor", self.config.name, height)
-            self.placement, self._settled = found, whole
+            self.placement, self._settled, self._at_rest = found, whole, at_rest
         elif self.placement is not None and (shift := _moved(self.placement, found)) is not None:
             # One look can be wrong, say with a foot on an anchor; two in a row are not.
             if self._moved:
                 log.warning("camera %s has moved by %.0f mm, or an anchor has", self.config.name, 1e3 * shift)
-                self.placement = found
+                self.placement, self._at_rest = found, at_rest
             self._moved = not self._moved
         else:
             self._moved = False
+            # Anchors that were hidden when it was located.
+            self._at_rest = at_rest | self._at_rest
 
-    def _fixes(self, sightings: list[MarkerSighting], arrival: float) -> Iterator[PoseFix]:
+    def _fixes(self, sightings: list[MarkerSighting], arrival: float) -> list[PoseFix]:
         placement = self.placement
         if placement is None:
-            return
-        for robot, mounts, planar in self._robots:
-            fix = solve(
-                robot,
-                mounts,
-                sightings,
-                self.intrinsics,
-                placement.world_from_camera,
-                planar=planar,
-                arrival=arrival,
-                placement_covariance=placement.covariance,
-            )
-            if fix is not None:
-                yield fix
+            return []
+        world_from_camera, covariance = placement.world_from_camera, placement.covariance
+        if (shake := measure_shake(self._at_rest, sightings, self.intrinsics)) is not None:
+            world_from_camera, covariance = shaken(world_from_camera, covariance, shake)
+        return solve(
+            self._bodies,
+            sightings,
+            self.intrinsics,
+            world_from_camera,
+            arrival=arrival,
+            placement_covariance=covariance,
+        )
 
     def _tracker(self, sightings: list[MarkerSighting]) -> Iterator[bytes]:
         for sighting in sightings:

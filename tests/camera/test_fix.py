@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from camera import fix
-from camera.fix import MarkerMount, MarkerPose, View, marker_corners, marker_poses, project, rays, solve
+from camera.fix import Body, MarkerMount, MarkerPose, View, marker_corners, marker_poses, project, rays, solve
 from camera.markers import MarkerSighting
 from fusion.geometry import exp_so3, rotation_about_z, transform, transform_points
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA, moved, nees, pose_error, sight
@@ -58,8 +58,13 @@ def test_planar_covariance_is_the_scatter(mounts, placed):
         if placement is not None:
             believed = moved(believed, random.multivariate_normal(np.zeros(6), placement))
         sightings = sight(mounts, truth, random, SIGMA_PX)
-        found = solve(
-            "rover", mounts, sightings, INTRINSICS, believed, planar=True, arrival=1.1, placement_covariance=placement
+        (found,) = solve(
+            [Body("rover", mounts, planar=True)],
+            sightings,
+            INTRINSICS,
+            believed,
+            arrival=1.1,
+            placement_covariance=placement,
         )
         (pose,) = found.hypotheses
         total += nees(truth, pose.position, pose.quaternion_wxyz, pose.covariance)
@@ -72,7 +77,7 @@ def test_six_dof_covariance_is_the_scatter():
     for _ in range(TRIALS):
         truth = on_the_floor(random) @ transform(exp_so3(random.normal(0.0, 0.2, 3)), [0.0, 0.0, 0.5])
         sightings = sight(TWO, truth, random, SIGMA_PX)
-        found = solve("rover", TWO, sightings, INTRINSICS, WORLD_FROM_CAMERA, planar=False, arrival=1.1)
+        (found,) = solve([Body("rover", TWO, planar=False)], sightings, INTRINSICS, WORLD_FROM_CAMERA, arrival=1.1)
         pose = found.hypotheses[0]
         total += nees(truth, pose.position, pose.quaternion_wxyz, pose.covariance)
     assert LOWEST < total / TRIALS < HIGHEST
@@ -85,7 +90,7 @@ def test_planar_is_far_better_determined_than_six_unknowns():
         truth = transform(rotation_about_z(random.uniform(-3, 3)), [random.uniform(-0.8, 0.8), 0.3, 0.0])
         sightings = sight(ONE, truth, random, SIGMA_PX)
         for errors, level in ((planar, True), (six, False)):
-            found = solve("r", ONE, sightings, INTRINSICS, WORLD_FROM_CAMERA, planar=level, arrival=1.1)
+            (found,) = solve([Body("r", ONE, planar=level)], sightings, INTRINSICS, WORLD_FROM_CAMERA, arrival=1.1)
             errors.append(found.hypotheses[0].position[:2] - truth[:2, 3])
     assert np.std(planar) < 0.2 * np.std(six)
     assert np.std(planar) < 4e-4
@@ -98,7 +103,7 @@ def test_a_fix_without_noise_is_exact_and_carries_its_origin():
         sightings = [
             MarkerSighting(s.t, s.camera, s.id, s.corners_px, SIGMA_PX) for s in sight(mounts, truth, random, 0.0)
         ]
-        found = solve("rover", mounts, sightings, INTRINSICS, WORLD_FROM_CAMERA, planar=True, arrival=1.25)
+        (found,) = solve([Body("rover", mounts, planar=True)], sightings, INTRINSICS, WORLD_FROM_CAMERA, arrival=1.25)
         assert (found.robot, found.t, found.arrival, found.source) == ("rover", 1.0, 1.25, "ceiling")
         assert found.markers == tuple(mount.id for mount in mounts)
         np.testing.assert_allclose(found.hypotheses[0].position, truth[:3, 3], atol=1e-6)
@@ -129,11 +134,11 @@ def test_what_cannot_be_is_no_fix():
     truth = transform(rotation_about_z(0.2), [0.4, -0.3, 0.0])
     random = np.random.default_rng(8)
     sightings = sight(ONE, truth, random, SIGMA_PX)
-    kwargs = {"planar": True, "arrival": 1.1}
-    assert solve("r", ONE, [], INTRINSICS, WORLD_FROM_CAMERA, **kwargs) is None
-    assert solve("r", [MarkerMount(9, 0.1, np.eye(4))], sightings, INTRINSICS, WORLD_FROM_CAMERA, **kwargs) is None
+    body, other = Body("r", ONE, planar=True), Body("s", [MarkerMount(9, 0.1, np.eye(4))], planar=True)
+    assert solve([body], [], INTRINSICS, WORLD_FROM_CAMERA, arrival=1.1) == []
+    assert solve([other], sightings, INTRINSICS, WORLD_FROM_CAMERA, arrival=1.1) == []
     # A camera that looks up sees no floor.
-    assert solve("r", ONE, sightings, INTRINSICS, transform(np.eye(3), [0.0, 0.0, 3.0]), **kwargs) is None
+    assert solve([body], sightings, INTRINSICS, transform(np.eye(3), [0.0, 0.0, 3.0]), arrival=1.1) == []
     assert marker_poses(np.zeros((4, 2)), 0.1, INTRINSICS, 0.1) == ()
 
 
@@ -141,8 +146,10 @@ def test_corners_that_contradict_the_model_widen_the_covariance():
     truth = transform(rotation_about_z(0.2), [0.4, -0.3, 0.0])
     sightings = sight(TWO, truth, np.random.default_rng(9), SIGMA_PX)
     wrong = MarkerSighting(1.0, "ceiling", 8, sightings[1].corners_px + 20.0, SIGMA_PX)
-    good = solve("r", TWO, sightings, INTRINSICS, WORLD_FROM_CAMERA, planar=True, arrival=1.1).hypotheses[0]
-    bad = solve("r", TWO, [sightings[0], wrong], INTRINSICS, WORLD_FROM_CAMERA, planar=True, arrival=1.1).hypotheses[0]
+    good, bad = (
+        solve([Body("r", TWO, planar=True)], seen, INTRINSICS, WORLD_FROM_CAMERA, arrival=1.1)[0].hypotheses[0]
+        for seen in (sightings, [sightings[0], wrong])
+    )
     assert bad.misfit > 100.0 * good.misfit
     # Of yaw, which height and tilt of the floor hardly touch
     assert bad.covariance[5, 5] > 100.0 * good.covariance[5, 5]
@@ -161,5 +168,5 @@ def test_a_camera_believed_elsewhere_moves_the_fix_with_it():
         for s in sight(ONE, truth, np.random.default_rng(10), 0.0)
     ]
     believed = transform(np.eye(3), [0.003, 0.0, 0.0]) @ WORLD_FROM_CAMERA
-    found = solve("r", ONE, sightings, INTRINSICS, believed, planar=True, arrival=1.1).hypotheses[0]
+    found = solve([Body("r", ONE, planar=True)], sightings, INTRINSICS, believed, arrival=1.1)[0].hypotheses[0]
     np.testing.assert_allclose(found.position, truth[:3, 3] + [0.003, 0.0, 0.0], atol=1e-5)

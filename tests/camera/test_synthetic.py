@@ -32,10 +32,10 @@ def test_the_same_seed_gives_the_same_frames():
 def test_edges_are_where_projection_says(room):
     pose = at(0.3, -0.2, 0.5) @ transform(exp_so3([0.2, -0.1, 0.0]), [0.0, 0.0, 0.0])
     image = room.render({3: (0.3, pose, pose)}, noise=0.0, blur_px=0.0)
-    corners, _ = refine_corners(image, room.corners_px(0.3, pose)[None], 6)
+    corners, _, _ = refine_corners(image, room.corners_px(0.3, pose)[None], 6)
     np.testing.assert_allclose(corners[0], room.corners_px(0.3, pose), atol=0.15)
     soft = room.render({3: (0.3, pose, pose)}, noise=0.0)
-    corners, _ = refine_corners(soft, room.corners_px(0.3, pose)[None], 6)
+    corners, _, _ = refine_corners(soft, room.corners_px(0.3, pose)[None], 6)
     np.testing.assert_allclose(corners[0], room.corners_px(0.3, pose), atol=0.06)
 
 

@@ -1,0 +1,251 @@
+"""Markers in the frames of a stream: followed from one to the next, looked for again when they are lost.
+
+A marker whose place is known to a few pixels has only its edges measured and its picture compared. Where that fails it
+is looked for around its place, at first in the cheapest way that finds a sharp marker. While one is missing, the whole
+picture is searched now and then.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from camera.markers import (
+    ENLARGE_UP_TO,
+    SMALLEST_SIDE_PX,
+    Box,
+    Found,
+    Image,
+    MarkerDetector,
+    MarkerSighting,
+    Pass,
+    Pixels,
+    distinct,
+    grey,
+)
+from fusion.measurements import Array
+
+# A place is good enough for edges alone up to this sigma, px, ...
+NEAR_PX = 3.0
+# ... for this long after the marker was told from all others, s, which is tried again this often, s.
+DECODED_WITHIN, DECODE_EVERY = 2.0, 0.25
+# s for which a marker's own motion tells where it may be.
+REMEMBERED = 1.0
+# Sigma of where a marker is by what it did before, px, and of how it may speed up or turn meanwhile, in sides of the
+# marker per s²: 3 m/s² for one of 14 cm.
+_SIGMA_PX, _SWERVE = 1.0, 20.0
+# Frames in a row without a marker after which it is no longer looked for in every one, nor where it was.
+_GIVEN_UP = 5
+# Frames, and s, between two searches of the whole picture while a marker is missing.
+SEARCH_EVERY, SEARCH_INTERVAL = 10, 0.5
+
+# Around a marker's place: one window is enough for one that is sharp and well lit, three find most others.
+_NEARBY = (Pass(windows=(13, 13, 10), darker=10.0), Pass())
+# The whole picture: cheap, for markers whose sides are not short, whose sides are, and that are all but too small, ...
+_LARGE, _SMALL, _TINY = (
+    Pass(0.5, windows=(13, 13, 10), darker=10.0),
+    Pass(windows=(13, 13, 10), darker=10.0),
+    Pass(2.0, windows=(13, 23, 10)),
+)
+# ... with all that OpenCV's detector does by itself, ...
+_THOROUGH = Pass()
+# ... and, in turn, in the ways that find what is blurred or dark.
+_HARD = (Pass(0.5, equalise=True, windows=(13, 13, 10)), Pass(0.25), Pass(equalise=True))
+_HARD_AND_SMALL = (Pass(2.0, windows=(5, 45, 20)), *_HARD)
+# Sides from which on the cheap ways find every marker that is sharp, px.
+_LARGE_PX, _SMALL_PX = 25.0, 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Where a marker should be seen: its corners (4, 2), px, and the standard deviation of either coordinate, px."""
+
+    corners_px: Array
+    sigma_px: float
+
+
+@dataclass(slots=True)
+class _Track:
+    """A marker as last seen. `t`: when; `decoded`: when it was last told from all others, s."""
+
+    t: float
+    corners_px: Array
+    velocity_px: Array
+    blur_px: float
+    decoded: float
+
+
+class MarkerTracker:
+    """Follows the markers `ids` of one dictionary; of those, `still` are at rest before a camera at rest.
+
+    For one thread, like the MarkerDetector that it has. Raises what that raises.
+    `sides_px`: how long the shortest and the longest side of a marker may be, where that is known.
+    `repeated`: ids that the last search saw at several places, which are left out: which one is meant, nobody knows.
+    """
+
+    def __init__(self, dictionary: str, ids: Collection[int], still: Collection[int] = ()) -> None:
+        self.ids = frozenset(ids)
+        self.sides_px = (SMALLEST_SIDE_PX, math.inf)
+        self.repeated: frozenset[int] = frozenset()
+        self._still = frozenset(still)
+        self._detector = MarkerDetector(dictionary, ids)
+        self._tracks: dict[int, _Track] = {}
+        # Frames since a marker was last seen, of those that were.
+        self._missed: dict[int, int] = {}
+        self._since_search = 0
+        self._searched = -math.inf
+        self._searches = itertools.count()
+
+    def track(
+        self,
+        image: Pixels,
+        t: float,
+        camera: str = "",
+        predictions: Mapping[int, Prediction] | None = None,
+        line_time: float = 0.0,
+    ) -> list[MarkerSighting]:
+        """The markers of the next frame, by id. `image` as in `grey`; `t`: s, mid-exposure of its first row.
+
+        `predictions` by id, from whoever knows more than the last frames tell. `line_time`: s from one row's exposure
+        to the next one's; each sighting is stamped by the row of its middle.
+        """
+        picture = grey(image)
+        expected = self._expected(t, predictions or {})
+        found = self._follow(picture, t, expected)
+        missed = {id: where for id, where in expected.items() if id not in found}
+        if missed:
+            found |= self._look_nearby(picture, missed)
+        self._since_search += 1
+        if missing := self.ids - found.keys():
+            due = self._since_search >= SEARCH_EVERY or not 0.0 <= t - self._searched < SEARCH_INTERVAL
+            if due or any(self._missed.get(id) == 0 for id in missing):
+                found = self._search(picture, found)
+                self._since_search, self._searched = 0, t
+        self._remember(found, t)
+        return [
+            MarkerSighting(
+                t + line_time * float(marker.corners_px[:, 1].mean()),
+                camera,
+                id,
+                marker.corners_px,
+                marker.sigma_px,
+            )
+            for id, marker in sorted(found.items())
+        ]
+
+    def _expected(self, t: float, predictions: Mapping[int, Prediction]) -> dict[int, Prediction]:
+        """Where to look: the best of what others predict and what the last frames tell."""
+        expected = {}
+        for id, track in self._tracks.items():
+            dt = t - track.t
+            if self._missed[id] > _GIVEN_UP or not (id in self._still or 0.0 <= dt <= REMEMBERED):
+                continue
+            if id in self._still:
+                expected[id] = Prediction(track.corners_px, _SIGMA_PX)
+            else:
+                side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
+                sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
+                expected[id] = Prediction(track.corners_px + track.velocity_px * dt, sigma)
+        for id, prediction in predictions.items():
+            if id in self.ids and self._missed.get(id, 0) <= _GIVEN_UP:
+                own = expected.get(id)
+                if own is None or prediction.sigma_px <= own.sigma_px:
+                    expected[id] = prediction
+        return {id: where for id, where in expected.items() if id not in self.repeated}
+
+    def _follow(self, picture: Image, t: float, expected: Mapping[int, Prediction]) -> dict[int, Found]:
+        """Those whose place and identity are known well enough for a look at their edges."""
+        near = [
+            id
+            for id, where in expected.items()
+            if where.sigma_px <= NEAR_PX
+            and (track := self._tracks.get(id)) is not None
+            and 0.0 <= t - track.decoded <= DECODED_WITHIN
+        ]
+        if not near:
+            return {}
+        tracks = [self._tracks[id] for id in near]
+        found = self._detector.follow(
+            picture,
+            near,
+            np.array([expected[id].corners_px for id in near]),
+            np.array([3.0 * (expected[id].sigma_px + track.blur_px) for id, track in zip(near, tracks, strict=True)]),
+            np.array([t - track.decoded >= DECODE_EVERY for track in tracks]),
+        )
+        return {marker.id: marker for marker in found if marker is not None}
+
+    def _look_nearby(self, picture: Image, missed: Mapping[int, Prediction]) -> dict[int, Found]:
+        """The others around where they should be."""
+        found: dict[int, Found] = {}
+        for way in _NEARBY:
+            left = {id: where for id, where in missed.items() if id not in found}
+            boxes, sides = [], []
+            for where in left.values():
+                side = float(np.linalg.norm(where.corners_px[1] - where.corners_px[0]))
+                margin = 0.25 * side + 3.0 + 3.0 * where.sigma_px
+                if (box := _box(where.corners_px, margin, picture.shape)) is not None:
+                    boxes.append(box)
+                    sides.append(side)
+            if not boxes:
+                break
+            looked = self._detector.look(picture, way, _about(min(sides), max(sides)), boxes)
+            found |= _nearest([marker for marker in looked if marker.id in left], left)
+        return found
+
+    def _search(self, picture: Image, found: dict[int, Found]) -> dict[int, Found]:
+        """The whole picture: cheaply, then with everything that the default detector does, then one way more."""
+        shortest = self.sides_px[0]
+        cheap = _LARGE if shortest >= _LARGE_PX else _SMALL if shortest >= _SMALL_PX else _TINY
+        hard = _HARD if shortest >= _SMALL_PX else _HARD_AND_SMALL
+        seen = list(found.values())
+        for way in (cheap, _THOROUGH, hard[next(self._searches) % len(hard)]):
+            if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
+                continue
+            seen = distinct(seen + self._detector.look(picture, way, _about(*self.sides_px)))
+            if self.ids <= {marker.id for marker in seen}:
+                break
+        by_id: dict[int, list[Found]] = {}
+        for marker in seen:
+            by_id.setdefault(marker.id, []).append(marker)
+        self.repeated = frozenset(id for id, markers in by_id.items() if len(markers) > 1)
+        return {id: markers[0] for id, markers in by_id.items() if id not in self.repeated}
+
+    def _remember(self, found: Mapping[int, Found], t: float) -> None:
+        for id in self._missed:
+            self._missed[id] += 1
+        for id, marker in found.items():
+            before = self._tracks.get(id)
+            velocity = np.zeros((4, 2))
+            if before is not None and 0.0 < t - before.t <= REMEMBERED:
+                velocity = (marker.corners_px - before.corners_px) / (t - before.t)
+            decoded = t if marker.decoded or before is None else before.decoded
+            self._tracks[id] = _Track(t, marker.corners_px, velocity, marker.blur_px, decoded)
+            self._missed[id] = 0
+
+
+def _about(shortest_px: float, longest_px: float) -> tuple[float, float]:
+    """Bounds that a detector's rough quadrilaterals keep to, of markers whose sides are expected to be so long."""
+    return 0.6 * shortest_px, 1.5 * longest_px
+
+
+def _box(corners_px: Array, margin: float, shape: tuple[int, ...]) -> Box | None:
+    """The part of the picture around some corners; None where nothing is left of it."""
+    left, top = np.floor(corners_px.min(axis=0) - margin).tolist()
+    right, bottom = np.ceil(corners_px.max(axis=0) + margin + 1.0).tolist()
+    box = max(int(left), 0), max(int(top), 0), min(int(right), shape[1]), min(int(bottom), shape[0])
+    return box if box[2] - box[0] >= SMALLEST_SIDE_PX and box[3] - box[1] >= SMALLEST_SIDE_PX else None
+
+
+def _nearest(found: Collection[Found], expected: Mapping[int, Prediction]) -> dict[int, Found]:
+    """Of several of one id the one nearest to its place."""
+    nearest: dict[int, Found] = {}
+    distance: dict[int, float] = {}
+    for marker in found:
+        off = float(np.linalg.norm(marker.corners_px.mean(axis=0) - expected[marker.id].corners_px.mean(axis=0)))
+        if off < distance.get(marker.id, math.inf):
+            nearest[marker.id], distance[marker.id] = marker, off
+    return nearest

@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+
+from camera.synthetic import Room
+from camera.tracking import SEARCH_EVERY, MarkerTracker, Prediction
+from fusion.geometry import rotation_about_z, transform
+from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA
+from tests.camera.test_markers import HARD, errors, frame
+
+RATE_HZ = 30.0
+ROOM = Room(INTRINSICS, WORLD_FROM_CAMERA, "4X4_50", 3)
+# 45 px
+SIZE = 0.2175
+
+
+def drive(k, rate_hz=RATE_HZ):
+    """world_from_marker of a marker on a robot that drives a curve at 0.9 m/s and 1 rad/s, in frame k."""
+    angle = k / rate_hz
+    return transform(rotation_about_z(angle), [0.9 * np.sin(angle), 0.4 - 0.9 * np.cos(angle), 0.1])
+
+
+def seen(pose, **light):
+    return ROOM.render({7: (SIZE, pose, pose)}, **light), ROOM.corners_px(SIZE, pose)
+
+
+EMPTY = ROOM.render({})
+
+
+def test_what_moves_is_followed_by_its_own_motion():
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    for k in range(30):
+        image, truth = seen(drive(k))
+        (sighting,) = tracker.track(image, k / RATE_HZ, "ceiling")
+        assert (sighting.id, sighting.t, sighting.camera) == (7, k / RATE_HZ, "ceiling")
+        assert np.abs(sighting.corners_px - truth).max() < 0.25, k
+
+
+def test_followed_by_predictions_where_its_own_motion_says_nothing():
+    random = np.random.default_rng(1)
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    for k in range(8):
+        # 2 frames a second and turns between them: the last place is of no use.
+        image, truth = seen(drive(k, 0.7))
+        prediction = Prediction(truth + random.normal(0.0, 1.0, (1, 2)), 1.0)
+        (sighting,) = tracker.track(image, k / 2.0, predictions={7: prediction})
+        assert np.abs(sighting.corners_px - truth).max() < 0.25, k
+
+
+def test_a_prediction_is_no_measurement():
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    image, truth = seen(drive(0))
+    assert len(tracker.track(image, 0.0)) == 1
+    # A robot that has gone, on a floor with texture and in the dark, where its filter still believes it to be
+    for k, picture in enumerate((EMPTY, ROOM.render({}, brightness=0.1), np.zeros_like(EMPTY)) * 3):
+        assert tracker.track(picture, (k + 1) / RATE_HZ, predictions={7: Prediction(truth, 0.5)}) == []
+
+
+def test_another_marker_at_its_place_is_not_taken_for_it():
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    image, truth = seen(drive(0))
+    tracker.track(image, 0.0)
+    other = ROOM.render({8: (SIZE, drive(0), drive(0))})
+    for k in range(12):
+        assert tracker.track(other, (k + 1) / RATE_HZ, predictions={7: Prediction(truth, 0.5)}) == []
+
+
+def test_what_comes_back_is_found_by_the_next_search():
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    image, _ = seen(drive(0))
+    tracker.track(image, 0.0)
+    assert [tracker.track(EMPTY, k / RATE_HZ) for k in range(1, 25)] == [[]] * 24
+    assert any(tracker.track(image, (25 + k) / RATE_HZ) for k in range(SEARCH_EVERY))
+
+
+def test_a_slow_camera_searches_every_frame():
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    image, _ = seen(drive(0))
+    for k in range(3):
+        assert tracker.track(EMPTY, 0.5 * k) == []
+    assert len(tracker.track(image, 2.0)) == 1
+
+
+@pytest.mark.parametrize("case", ["dark", "small", "blurred"])
+def test_hard_frames_are_searched_as_by_a_detector_and_then_followed(case):
+    image, truth = frame(**HARD[case])
+    tracker = MarkerTracker("4X4_50", ids=range(6))
+    sides = [float(np.linalg.norm(corners[1] - corners[0])) for corners in truth.values()]
+    tracker.sides_px = min(sides), max(sides)
+    # Searches, as many as there are ways to look, and then a few frames in which what was found is followed.
+    for k in range(8):
+        sightings = tracker.track(image, min(0.5 * k, 2.0 + k / RATE_HZ))
+    assert [sighting.id for sighting in sightings] == list(range(6))
+    over_sigma = errors(sightings, truth) / np.array([sighting.sigma_px for sighting in sightings])[:, None, None]
+    assert np.sqrt(np.mean(over_sigma**2)) < 1.5
