@@ -9,6 +9,8 @@ which has no other.
 from __future__ import annotations
 
 import argparse
+import functools
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import get_args
@@ -25,9 +27,8 @@ CHUNKS = (92, 4096)
 
 def parsers() -> None:
     """Prints bytes/s of processor time of each parser on its own clean stream, over those of the wire."""
-    print(
-        f"{'protocol':18} {'bytes/sample':>12} {'us/sample':>10}" + "".join(f"{f'x wire, {n} B':>15}" for n in CHUNKS)
-    )
+    columns = "".join(f"{f'x wire, {chunk} B':>15}" for chunk in CHUNKS)
+    print(f"{'protocol':18} {'bytes/sample':>12} {'us/sample':>10}{columns}")
     samples = rocking(20.0)
     for protocol in get_args(ProtocolName):
         if protocol == "auto":
@@ -37,9 +38,7 @@ def parsers() -> None:
         speeds = []
         for chunk in CHUNKS:
             parts = [data[i : i + chunk] for i in range(0, len(data), chunk)]
-            speeds.append(
-                len(data) / _best(lambda parts=parts, protocol=protocol: _parse(protocol, parts, len(samples)))
-            )
+            speeds.append(len(data) / _best(functools.partial(_parse, protocol, parts, len(samples))))
         limit = RVC_WIRE if protocol == "bno08x-rvc" else WIRE
         size = len(data) / len(samples)
         times = "".join(f"{speed / limit:15.0f}" for speed in speeds)
@@ -53,7 +52,7 @@ def _parse(protocol: ProtocolName, parts: Sequence[bytes], expected: int) -> Non
 
 
 def _rvc(samples: Sequence[RawSample]) -> list[bytes]:
-    return [rvc_frame(i, 0.1 * (i % 1800), 1.0, 0.02 * (i % 900), sample[4:]) for i, sample in enumerate(samples)]
+    return [rvc_frame(i, 90.0 * math.sin(0.01 * i), 1.0, 20.0, sample[4:]) for i, sample in enumerate(samples)]
 
 
 def _best(work: Callable[[], None], runs: int = 5) -> float:

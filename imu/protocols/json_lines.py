@@ -34,6 +34,6 @@ def _decode(line: bytes) -> RawSample | None:
         reading = _DECODER.decode(line)
     except msgspec.ValidationError as error:
         raise DroppedError("wrong fields", f"{error} in {line[:80]!r}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise DroppedError("not JSON", repr(line[:80])) from None
     return raw_sample(reading.t, reading.gyro, reading.accel)

@@ -81,6 +81,7 @@ JSON_FAULTS = {
     b"[1, 2, 3]": "wrong fields",
     b'{"gyro": [0, 0, 0], "accel"': "not JSON",
     b"\xff\xfe": "not JSON",
+    b'{"x": ' + b"[" * 4000: "not JSON",
     b'{"gyro": [0, 0, 1e9], "accel": [0, 0, 9.8]}': "out of range",
     b'{"t": 1e200, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]}': "out of range",
 }
