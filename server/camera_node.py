@@ -23,7 +23,7 @@ from websockets.exceptions import WebSocketException
 
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import DeliveryMeter, black
-from camera.markers import MarkerDetector
+from camera.tracking import MarkerTracker
 from server.camera_messages import CameraHello, CameraWelcome, FrameSeen, MarkerSeen, NodeStatus, encode, to_node
 from server.messages import ClockAnswer, ClockQuestion, Error, MessageError
 from server.terminal import log_to_stderr, until_stopped
@@ -66,7 +66,7 @@ class Watch:
         self._seen = seen
         self._ended = ended
         try:
-            self._detector = MarkerDetector(welcome.dictionary, welcome.ids)
+            self._tracker = MarkerTracker(welcome.dictionary, welcome.ids, welcome.still)
         except ValueError as error:
             raise NodeError(f"the service's welcome: {error}") from None
         self._source: FrameSource | None = None
@@ -117,24 +117,27 @@ class Watch:
     def _look(self, frame: Frame) -> None:
         start = time.monotonic()
         self.meter.add(frame, start)
-        sightings = self._detector.detect(frame.image, frame.t)
+        sightings = self._tracker.track(frame.image, frame.t, line_time=frame.line_time)
         if self.trouble:
             log.info("frames are coming, %d x %d px", frame.image.shape[1], frame.image.shape[0])
             self.trouble = ""
         markers = [MarkerSeen(s.id, s.t, s.corners_px.tolist(), s.sigma_px) for s in sightings]
         height_px, width_px = frame.image.shape[:2]
-        now = time.monotonic()
-        self._seen(FrameSeen(frame.t, now, frame.sequence, width_px, height_px, 1e3 * (now - start), markers))
+        detect_ms = 1e3 * (time.monotonic() - start)
+        # When it is sent is to be seen.
+        self._seen(FrameSeen(frame.t, frame.t, frame.sequence, width_px, height_px, detect_ms, markers))
 
 
 class Node:
     """The connection, and what is to go over it. `run` is the whole of it.
 
-    `url`: of the service, without a path. `open`: how to open the camera that the welcome describes.
-    `dropped`: frames that were not sent.
+    `url`: of the service, without a path. `open`: how to open the camera that the welcome describes; its frames are
+    stamped by `clock`. `dropped`: frames that were not sent.
     """
 
-    def __init__(self, url: str, name: str, open: Open, token: str = "") -> None:
+    def __init__(
+        self, url: str, name: str, open: Open, token: str = "", clock: Callable[[], float] = time.monotonic
+    ) -> None:
         parts = urlsplit(url)
         if parts.scheme not in ("ws", "wss") or not parts.netloc:
             raise NodeError(f"--server {url}: an address such as ws://192.168.1.10:5678 is needed")
@@ -142,6 +145,7 @@ class Node:
         self._name = name
         self._token = token
         self._open = open
+        self._clock = clock
         self.dropped = 0
         self._watch: Watch | None = None
         self._latest: FrameSeen | None = None
@@ -261,7 +265,7 @@ class Node:
             self._news.clear()
             seen, self._latest = self._latest, None
             if seen is not None:
-                await connection.send(encode(msgspec.structs.replace(seen, sent=time.monotonic())), text=True)
+                await connection.send(encode(msgspec.structs.replace(seen, sent=self._clock())), text=True)
             if self._ended.is_set():
                 await connection.send(encode(self._status("the source has ended")), text=True)
                 return
@@ -285,7 +289,7 @@ class Node:
         """Answer the service's questions, until it ends the connection."""
         said = ""
         async for data in connection:
-            received = time.monotonic()
+            received = self._clock()
             try:
                 message = to_node(data)
             except MessageError as error:
@@ -293,7 +297,7 @@ class Node:
                 continue
             match message:
                 case ClockQuestion(id=id):
-                    await connection.send(encode(ClockAnswer(id, received, time.monotonic())), text=True)
+                    await connection.send(encode(ClockAnswer(id, received, self._clock())), text=True)
                 case Error(reason=reason) if reason != said:
                     said = reason
                     log.warning("the service says: %s", reason)

@@ -11,7 +11,7 @@ import cv2
 import msgspec
 
 from server.app import SERVICE, Service
-from server.config import Config, load
+from server.config import Config, ConfigError, load
 from server.demo.room import DemoRoom
 from server.recording import Recorder
 from server.terminal import log_to_stderr, stop_signals
@@ -26,6 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PORT",
         help="port to listen on, instead of the configured one; 0 for any free one",
     )
+    parser.add_argument(
+        "--remote-camera", action="store_true", help="the simulated room's camera in a process of its own, as on a Pi"
+    )
+    parser.add_argument("--light", type=_light, metavar="L", help="of the simulated room: 1 is well lit, 0.1 is dusk")
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="keep all inputs there, for `steadfix replay`")
 
 
@@ -35,7 +39,19 @@ def _port(text: str) -> int:
     return int(text)
 
 
+def _light(text: str) -> float:
+    try:
+        light = float(text)
+    except ValueError:
+        light = -1.0
+    if not 0.0 <= light <= 2.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no light, 0 to 2 are")
+    return light
+
+
 def run(args: argparse.Namespace) -> int:
+    if args.config is not None and (args.remote_camera or args.light is not None):
+        raise ConfigError("--remote-camera and --light are for the simulated room, which is there without CONFIG.toml")
     log_to_stderr()
     # One thread for each camera is what keeps several of them fast.
     cv2.setNumThreads(1)
@@ -47,7 +63,7 @@ async def _run(args: argparse.Namespace) -> int:
     if args.config is not None:
         await _serve_until(stop, load(args.config), args)
         return 0
-    room = DemoRoom()
+    room = DemoRoom(remote_camera=args.remote_camera, light=1.0 if args.light is None else args.light)
     try:
         await _serve_until(stop, room.config(), args, room)
     finally:

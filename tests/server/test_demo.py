@@ -26,7 +26,8 @@ from server.config import Config
 from server.demo.body import ROOM_X, ROOM_Y, Body, Imu
 from server.demo.courses import SPACING, course
 from server.demo.robot import STALE, Driver
-from server.demo.room import COURSES, HISTORY, DemoRoom
+from server.demo.room import COURSES, DemoRoom
+from server.demo.truth import HISTORY
 from server.messages import PoseMessage, pose_message
 
 TIMEOUT = 100.0
