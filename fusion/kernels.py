@@ -30,7 +30,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import carray, njit, types
+from numba.extending import intrinsic
 
 from fusion.measurements import Array
 from fusion.params import GRAVITY
@@ -40,7 +41,8 @@ Q, V, POS, BG, BA, TD, TILT = 0, 4, 7, 10, 13, 16, 17
 COV = 20
 N = 18
 TH, DV, DP, DBG, DBA, DTD, DTILT = 0, 3, 6, 9, 12, 15, 16
-BLOCK = COV + N * N
+CORRECTED = COV + N * N  # sum of all moves by updates, world axes: position (3), rotation vector (3)
+BLOCK = CORRECTED + 6
 
 # --- The whole state of a robot: the filter, a second one that grows from rejected fixes, and bookkeeping ---------
 MAIN, SHADOW, AUX = 0, BLOCK, 2 * BLOCK
@@ -74,11 +76,10 @@ STILL_BARRED = AUX + 55  # s: not at rest until then, a fix has said otherwise
 MOVING_GYRO, MOVING_ACCEL = AUX + 56, AUX + 57  # mean variance of a window in motion
 STILL_SURE = AUX + 58  # 1 where rest and motion differ in that
 USUAL_SPEED2 = AUX + 59  # (m/s)^2: mean squared speed along an axis while the robot moves
-REJECTED_RUN = AUX + 66  # rejects since the last accepted fix
-CORRECTED = AUX + 60  # sum of all moves by updates, world axes: position (3), rotation vector (3)
-ADAPTED = AUX + 67  # fixes that the noise has learnt from, of those in quick succession a part
-T_ADAPTED = AUX + 68  # s: the last of them
-STATE = AUX + 69
+REJECTED_RUN = AUX + 60  # rejects since the last accepted fix
+ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
+T_ADAPTED = AUX + 62  # s: the last of them
+STATE = AUX + 63
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -178,17 +179,30 @@ GRAVITY_SIGMA = 0.5  # m/s2: how far the mean specific force before the start ma
 UNKNOWN_TILT_SIGMA = math.radians(30.0)  # of a flat marker whose two poses are too close to call
 
 _jit: Any = njit(cache=True, error_model="numpy", nogil=True)
+# Where most of the time goes: products and sums in one instruction each.
+_fused: Any = njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract"})
 # For what is called at one place for every sample: a call is dear, since each array is seven arguments.
 _inline: Any = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+
+
+@intrinsic
+def _pointer(_context: Any, _address: Any) -> Any:
+    """An address as a pointer to float64."""
+    result = types.CPointer(types.float64)
+
+    def code(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(result))
+
+    return result(types.intp), code
 
 
 # ------------------------------------------------------------------------------------------------------ rotations
 
 
 @_jit
-def _matrix(s, o, B):
-    """B (3, 3) = rotation of the quaternion s[o:o+4]."""
-    w, x, y, z = s[o], s[o + 1], s[o + 2], s[o + 3]
+def _matrix(q, B):
+    """B (3, 3) = rotation of the quaternion q[:4]."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
     B[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     B[0, 1] = 2.0 * (x * y - w * z)
     B[0, 2] = 2.0 * (x * z + w * y)
@@ -201,31 +215,35 @@ def _matrix(s, o, B):
 
 
 @_jit
-def _rotation_vector(s, o, r, k, y, at):
-    """y[at:at+3] = Log(q^-1 r) of the quaternions q = s[o:o+4] and r[k:k+4], of length <= pi."""
-    w, x1, y1, z1 = s[o], s[o + 1], s[o + 2], s[o + 3]
-    a = w * r[k + 1] - x1 * r[k] - y1 * r[k + 3] + z1 * r[k + 2]
-    b = w * r[k + 2] + x1 * r[k + 3] - y1 * r[k] - z1 * r[k + 1]
-    c = w * r[k + 3] - x1 * r[k + 2] + y1 * r[k + 1] - z1 * r[k]
-    d = w * r[k] + x1 * r[k + 1] + y1 * r[k + 2] + z1 * r[k + 3]
+def _rotation_vector(q, r, y):
+    """y[:3] = Log(q⁻¹ r) of the quaternions q[:4] and r[:4], of length <= pi."""
+    a = q[0] * r[1] - q[1] * r[0] - q[2] * r[3] + q[3] * r[2]
+    b = q[0] * r[2] + q[1] * r[3] - q[2] * r[0] - q[3] * r[1]
+    c = q[0] * r[3] - q[1] * r[2] + q[2] * r[1] - q[3] * r[0]
+    d = q[0] * r[0] + q[1] * r[1] + q[2] * r[2] + q[3] * r[3]
     n = math.sqrt(a * a + b * b + c * c)
     sign = -1.0 if d < 0.0 else 1.0
     factor = sign * (2.0 if n < 1e-9 else 2.0 * math.atan2(n, abs(d)) / n)
-    y[at] = factor * a
-    y[at + 1] = factor * b
-    y[at + 2] = factor * c
+    y[0], y[1], y[2] = factor * a, factor * b, factor * c
 
 
 @_jit
-def _length(a, at):
-    """Of the vector a[at:at+3]."""
-    return math.sqrt(a[at] * a[at] + a[at + 1] * a[at + 1] + a[at + 2] * a[at + 2])
+def _length(a):
+    """Of the vector a[:3]."""
+    return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+@_jit
+def _fill(a, b):
+    """a[:] = b, vectors; numba's own assignment costs seconds of compilation for what it says of other shapes."""
+    for i in range(a.shape[0]):
+        a[i] = b[i]
 
 
 # ---------------------------------------------------------------------------------------------------------- filter
 
 
-@_jit
+@_fused
 def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_walk, accel_bias_walk):
     """Carry the filter f (BLOCK,) over `dt` s of constant angular rate and specific force, both raw.
 
@@ -340,15 +358,15 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_wa
 
 
 @_jit
-def update(s, o, H, y, R):
-    """Kalman update of the filter at s[o:] with innovation y (m,), H (m, 18), R (m, m). False: S is not positive.
+def update(f, H, y, R):
+    """Kalman update of the filter f (BLOCK,) with innovation y (m,), H (m, 18), R (m, m). False: S is not positive.
 
     P - K S Kᵀ with K S Kᵀ = Wᵀ W, W = L⁻¹ H P, S = L Lᵀ: symmetric as it is computed. The state then moves by the
     error dx, and P is expressed in the error about the new state: with R̂⁺ = R̂ Exp(δθ̂), the new error is
     Jr(δθ̂) ε for attitude and Exp(-δθ̂) ε for velocity and position.
     """
     m = y.shape[0]
-    c = o + COV
+    c = COV
     W = np.zeros((m, N))
     S = R.copy()
     e = y.copy()
@@ -357,7 +375,7 @@ def update(s, o, H, y, R):
             h = H[a, k]
             if h != 0.0:
                 for j in range(N):
-                    W[a, j] += h * s[c + N * k + j]
+                    W[a, j] += h * f[c + N * k + j]
     for a in range(m):
         for b in range(m):
             for k in range(N):
@@ -379,21 +397,23 @@ def update(s, o, H, y, R):
             W[a, j] /= S[a, a]
     dx = np.zeros(N)
     for a in range(m):
-        for i in range(N):
-            dx[i] += W[a, i] * e[a]
-            for j in range(N):
-                s[c + N * i + j] -= W[a, i] * W[a, j]
+        # in this order the inner loop is unrolled and the outer vectorised, after one look at whether W overlaps f
+        for j in range(N):
+            w = W[a, j]
+            dx[j] += w * e[a]
+            for i in range(N):
+                f[c + N * i + j] -= W[a, i] * w
 
     B = np.empty((3, 3))
-    _matrix(s, o, B)
+    _matrix(f, B)
     for i in range(3):
-        if o == MAIN:
-            s[CORRECTED + i] += B[i, 0] * dx[DP] + B[i, 1] * dx[DP + 1] + B[i, 2] * dx[DP + 2]
-            s[CORRECTED + 3 + i] += B[i, 0] * dx[TH] + B[i, 1] * dx[TH + 1] + B[i, 2] * dx[TH + 2]
-        s[o + V + i] += B[i, 0] * dx[DV] + B[i, 1] * dx[DV + 1] + B[i, 2] * dx[DV + 2]
-        s[o + POS + i] += B[i, 0] * dx[DP] + B[i, 1] * dx[DP + 1] + B[i, 2] * dx[DP + 2]
+        move = B[i, 0] * dx[DP] + B[i, 1] * dx[DP + 1] + B[i, 2] * dx[DP + 2]
+        f[POS + i] += move
+        f[CORRECTED + i] += move
+        f[CORRECTED + 3 + i] += B[i, 0] * dx[TH] + B[i, 1] * dx[TH + 1] + B[i, 2] * dx[TH + 2]
+        f[V + i] += B[i, 0] * dx[DV] + B[i, 1] * dx[DV + 1] + B[i, 2] * dx[DV + 2]
     for i in range(DBG, N):
-        s[o + BG - DBG + i] += dx[i]
+        f[BG - DBG + i] += dx[i]
 
     x, y_, z = dx[0], dx[1], dx[2]
     angle2 = x * x + y_ * y_ + z * z
@@ -407,13 +427,13 @@ def update(s, o, H, y, R):
         sincc = (1.0 - sinc) / angle2
         w, h = math.cos(0.5 * angle), math.sin(0.5 * angle) / angle
     bx, by, bz = h * x, h * y_, h * z
-    qw, qx, qy, qz = s[o], s[o + 1], s[o + 2], s[o + 3]
+    qw, qx, qy, qz = f[0], f[1], f[2], f[3]
     nw = qw * w - qx * bx - qy * by - qz * bz
     nx = qw * bx + qx * w + qy * bz - qz * by
     ny = qw * by - qx * bz + qy * w + qz * bx
     nz = qw * bz + qx * by - qy * bx + qz * w
     scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
-    s[o], s[o + 1], s[o + 2], s[o + 3] = nw * scale, nx * scale, ny * scale, nz * scale
+    f[0], f[1], f[2], f[3] = nw * scale, nx * scale, ny * scale, nz * scale
 
     K = np.zeros((3, 3))
     K[0, 1], K[0, 2], K[1, 2] = -z, y_, -x
@@ -425,26 +445,24 @@ def update(s, o, H, y, R):
             K2 = K[i, 0] * K[0, j] + K[i, 1] * K[1, j] + K[i, 2] * K[2, j]
             J[0, i, j] += sincc * K2 - half_cosc * K[i, j]
             J[1, i, j] += half_cosc * K2 - sinc * K[i, j]
-    # rows by J, then transpose, twice: J P Jᵀ. Only the mean of P and Pᵀ is kept: without that the rounding of a few
-    # minutes grows into a P that is none.
-    for _ in range(2):
-        for block in range(3):
-            n = min(block, 1)
-            r = c + 3 * N * block
-            for j in range(N):
-                p0, p1, p2 = s[r + j], s[r + N + j], s[r + 2 * N + j]
+    # J P Jᵀ as J (J P)ᵀ, the second round for the first nine columns only, as in `predict`. There only the mean of P
+    # and Pᵀ is kept: without that the rounding of a few minutes grows into a P that is none.
+    for second in range(2):
+        for j in range(N - 9 * second):
+            for block in range(3):
+                n = min(block, 1)
+                r = c + 3 * N * block + j
+                p0, p1, p2 = f[r], f[r + N], f[r + 2 * N]
                 for i in range(3):
-                    s[r + N * i + j] = J[n, i, 0] * p0 + J[n, i, 1] * p1 + J[n, i, 2] * p2
-        for i in range(N):
+                    f[r + N * i] = J[n, i, 0] * p0 + J[n, i, 1] * p1 + J[n, i, 2] * p2
+        for i in range(9):
             for j in range(i):
-                swap = s[c + N * i + j]
-                s[c + N * i + j] = s[c + N * j + i]
-                s[c + N * j + i] = swap
-    for i in range(N):
-        for j in range(i):
-            mean = 0.5 * (s[c + N * i + j] + s[c + N * j + i])
-            s[c + N * i + j] = mean
-            s[c + N * j + i] = mean
+                upper, lower = f[c + N * j + i], f[c + N * i + j]
+                mean = 0.5 * (upper + lower)
+                f[c + N * j + i] = mean if second else lower
+                f[c + N * i + j] = mean if second else upper
+            for j in range(9, N):
+                f[c + N * j + i] = f[c + N * i + j]
     return True
 
 
@@ -452,25 +470,38 @@ def update(s, o, H, y, R):
 
 
 @_jit
-def _distance(S, y, first, end):
-    """Squared Mahalanobis distance of y[first:end], and log|S| of that block; inf where S is no covariance."""
-    L = S.copy()
-    e = y.copy()
-    d2, log_det = 0.0, 0.0
-    for i in range(first, end):
-        for j in range(first, i):
-            for k in range(first, j):
-                L[i, j] -= L[i, k] * L[j, k]
-            L[i, j] /= L[j, j]
-            L[i, i] -= L[i, j] * L[i, j]
-            e[i] -= L[i, j] * e[j]
-        if not L[i, i] > 0.0:
-            return math.inf, math.inf
-        log_det += math.log(L[i, i])
-        d2 += e[i] * e[i] / L[i, i]
-        L[i, i] = math.sqrt(L[i, i])
-        e[i] /= L[i, i]
-    return d2, log_det
+def _distance(S, y, d2):
+    """Squared Mahalanobis distance of y (3,) or (6,) -> d2[0], of its first three -> d2[1], of the others -> d2[2].
+
+    -> log|S|. It and distances are inf where S is no covariance.
+    """
+    m = y.shape[0]
+    log_det = 0.0
+    d2[0] = math.inf
+    L = np.empty((m, m))
+    e = np.empty(m)
+    for first in range(m - 3, -1, -3):
+        total = 0.0
+        log_det = 0.0
+        for i in range(first, m):
+            e[i] = y[i]
+            for j in range(first, i + 1):
+                L[i, j] = S[i, j]
+                for k in range(first, j):
+                    L[i, j] -= L[i, k] * L[j, k]
+                if j < i:
+                    L[i, j] /= L[j, j]
+                    e[i] -= L[i, j] * e[j]
+            if not L[i, i] > 0.0:
+                return math.inf
+            log_det += math.log(L[i, i])
+            L[i, i] = math.sqrt(L[i, i])
+            e[i] /= L[i, i]
+            total += e[i] * e[i]
+            if i == 2:
+                d2[1] = total
+        d2[2 if first > 0 else 0] = total
+    return log_det
 
 
 @_jit
@@ -485,7 +516,7 @@ def _weigh(s, o, prm, fix, H, y, R, S):
     a hypothesis is d² + log|S| + misfit: twice the negative log-likelihood of the pose and of the pixels.
     """
     B = np.empty((3, 3))
-    _matrix(s, o, B)
+    _matrix(s[o:], B)
     motion = np.zeros(6)
     for i in range(3):
         motion[i] = B[0, i] * s[o + V] + B[1, i] * s[o + V + 1] + B[2, i] * s[o + V + 2]
@@ -510,7 +541,7 @@ def _weigh(s, o, prm, fix, H, y, R, S):
             y[i] = 0.0
             for j in range(3):
                 y[i] += B[j, i] * (fix[k + H_POS + j] - s[o + POS + j])
-        _rotation_vector(s, o, fix, k + H_QUAT, y, 3)
+        _rotation_vector(s[o:], fix[k + H_QUAT :], y[3:])
         for i in range(6):
             for j in range(6):
                 half[i, j] = 0.0
@@ -532,18 +563,18 @@ def _weigh(s, o, prm, fix, H, y, R, S):
                 d = o + COV + N * DTD
                 S[i, j] = total + s[a + b] + motion[i] * s[d + b] + s[a + DTD] * motion[j]
                 S[i, j] += motion[i] * s[d + DTD] * motion[j]
-        d2, log_det = _distance(S, y, 0, 6)
-        score = d2 + log_det + fix[k + H_MISFIT]
+        log_det = _distance(S, y, fix[F_D2:])
+        score = fix[F_D2] + log_det + fix[k + H_MISFIT]
+        if count == 1:
+            break
         if trial == count:
-            fix[F_D2] = d2
-        elif score < best:
+            continue
+        if score < best:
             margin = best - score
             best = score
             chosen = trial
         else:
             margin = score - best
-    fix[F_D2_POSITION] = _distance(S, y, 0, 3)[0]
-    fix[F_D2_ATTITUDE] = _distance(S, y, 3, 6)[0]
     fix[F_CHOSEN] = chosen
     fix[F_MARGIN] = margin
     for i in range(6):
@@ -552,30 +583,30 @@ def _weigh(s, o, prm, fix, H, y, R, S):
 
 
 @_jit
-def _start(s, o, prm, fix, k, afresh):
-    """Pose and covariance of the filter at s[o:] from the hypothesis at fix[k:]; the rest stays, or starts afresh."""
-    c = o + COV
+def _start(f, prm, fix, k, afresh):
+    """Pose and covariance of the filter f (BLOCK,) from the hypothesis at fix[k:]; the rest stays, or starts afresh."""
+    c = COV
     if afresh:
         for i in range(BLOCK):
-            s[o + i] = 0.0
+            f[i] = 0.0
         for i in range(3):
-            s[c + (N + 1) * (DBG + i)] = prm[GYRO_BIAS_SIGMA] ** 2
-            s[c + (N + 1) * (DBA + i)] = prm[ACCEL_BIAS_SIGMA] ** 2
-        s[c + (N + 1) * DTD] = prm[TIME_OFFSET_SIGMA] ** 2
+            f[c + (N + 1) * (DBG + i)] = prm[GYRO_BIAS_SIGMA] ** 2
+            f[c + (N + 1) * (DBA + i)] = prm[ACCEL_BIAS_SIGMA] ** 2
+        f[c + (N + 1) * DTD] = prm[TIME_OFFSET_SIGMA] ** 2
         for i in range(2):
-            s[c + (N + 1) * (DTILT + i)] = prm[TILT_SIGMA] ** 2
+            f[c + (N + 1) * (DTILT + i)] = prm[TILT_SIGMA] ** 2
     for i in range(DBG):
         for j in range(N):
-            s[c + N * i + j] = 0.0
-            s[c + N * j + i] = 0.0
+            f[c + N * i + j] = 0.0
+            f[c + N * j + i] = 0.0
     for i in range(4):
-        s[o + Q + i] = fix[k + H_QUAT + i]
+        f[Q + i] = fix[k + H_QUAT + i]
     B = np.empty((3, 3))
-    _matrix(s, o, B)
+    _matrix(f, B)
     for i in range(3):
-        s[o + POS + i] = fix[k + H_POS + i]
-        s[o + V + i] = 0.0
-        s[c + (N + 1) * (DV + i)] = prm[VELOCITY_SIGMA] * prm[VELOCITY_SIGMA]
+        f[POS + i] = fix[k + H_POS + i]
+        f[V + i] = 0.0
+        f[c + (N + 1) * (DV + i)] = prm[VELOCITY_SIGMA] * prm[VELOCITY_SIGMA]
     # from world into body axes; the fix's halves are (position, attitude), the filter's are (DP, TH)
     for i in range(6):
         for j in range(6):
@@ -583,7 +614,7 @@ def _start(s, o, prm, fix, k, afresh):
             for m in range(3):
                 for n in range(3):
                     total += B[m, i % 3] * fix[k + H_COV + 6 * (3 * (i // 3) + m) + 3 * (j // 3) + n] * B[n, j % 3]
-            s[c + N * (DP - 6 * (i // 3) + i % 3) + DP - 6 * (j // 3) + j % 3] = total
+            f[c + N * (DP - 6 * (i // 3) + i % 3) + DP - 6 * (j // 3) + j % 3] = total
 
 
 @_jit
@@ -595,7 +626,7 @@ def _initialise(s, prm, fix):
         k = F_HYPOTHESES + h * HYPOTHESIS
         score[h] = fix[k + H_MISFIT]
         if s[ACCEL_COUNT] > 0.0:
-            _matrix(fix, k + H_QUAT, B)
+            _matrix(fix[k + H_QUAT :], B)
             for i in range(3):
                 score[h] += ((s[ACCEL_MEAN + i] - GRAVITY * B[2, i]) / GRAVITY_SIGMA) ** 2
     chosen = F_HYPOTHESES
@@ -606,14 +637,14 @@ def _initialise(s, prm, fix):
             fix = fix.copy()
             for i in range(3, 5):
                 fix[chosen + H_COV + 7 * i] += UNKNOWN_TILT_SIGMA * UNKNOWN_TILT_SIGMA
-    _start(s, MAIN, prm, fix, chosen, True)
+    _start(s[:BLOCK], prm, fix, chosen, s[INITIALISED] == 0.0)
     s[INITIALISED] = 1.0
     s[ACCEPTED_COUNT] = 1.0
     s[T_ACCEPTED] = s[T]
     if s[ACCEL_COUNT] == 0.0:
         return
     # mean specific force = g R̂ᵀu + b_a, u up: H = [g u_b]x on attitude, 1 on bias, g R̂ᵀ[e_x e_y] on tilt
-    _matrix(s, MAIN, B)
+    _matrix(s, B)
     H, y, R, S = np.zeros((3, N)), np.empty(3), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):
         y[i] = s[ACCEL_MEAN + i] - GRAVITY * B[2, i]
@@ -630,8 +661,10 @@ def _initialise(s, prm, fix):
                 for n in range(N):
                     S[i, j] += H[i, m] * s[COV + N * m + n] * H[j, n]
     # A fix whose tilt gravity denies is likely wrong: then nothing is to be learnt of the biases from it.
-    if _distance(S, y, 0, 3)[0] <= prm[GATE_BLOCK]:
-        update(s, MAIN, H, y, R)
+    d2 = np.empty(2)
+    _distance(S, y, d2)
+    if d2[0] <= prm[GATE_BLOCK]:
+        update(s[:BLOCK], H, y, R)
 
 
 @_jit
@@ -681,7 +714,7 @@ def _judge(s, prm, fix):
     fix[F_OUTCOME] = REJECTED
     shadows = s[SHADOW_COUNT] > 0.0
     agrees = False
-    figures = fix[F_D2:F_REPORTED].copy()
+    figures = np.empty(F_REPORTED - F_D2)
     for o in range(MAIN, SHADOW + 1 if shadows else SHADOW, BLOCK):
         _weigh(s, o, prm, fix, H, y, R, S)
         blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
@@ -695,9 +728,11 @@ def _judge(s, prm, fix):
                 if n > 1.0 and share > 0.0:
                     before, after = share + (1.0 - share) / (n - 1.0), share + (1.0 - share) / n
                     more = before * after / (before - after) - 1.0
-                    S += more * R
-                    R += more * R
-            figures[:] = fix[F_D2:F_REPORTED]
+                    for i in range(6):
+                        for j in range(6):
+                            S[i, j] += more * R[i, j]
+                            R[i, j] += more * R[i, j]
+            _fill(figures, fix[F_D2:])
             if fix[F_D2_POSITION] > LEAVE_STILL:
                 s[STILL_SINCE] = math.inf
                 s[STILL_BARRED] = s[T] + STILL_PAUSE
@@ -708,8 +743,10 @@ def _judge(s, prm, fix):
             _adapt(s, prm, figures, MOST_TAUGHT)
         if ratio > 1.0:
             # as if the fix were less certain, until it just passes
-            R += (ratio - 1.0) * S
-        if update(s, o, H, y, R):
+            for i in range(6):
+                for j in range(6):
+                    R[i, j] += (ratio - 1.0) * S[i, j]
+        if update(s[o : o + BLOCK], H, y, R):
             if o == MAIN:
                 s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
                 s[ACCEPTED_COUNT] += 1.0
@@ -717,11 +754,11 @@ def _judge(s, prm, fix):
                 return
             agrees = True
     fix[F_OUTCOME] = REJECTED
-    fix[F_D2:F_REPORTED] = figures
+    _fill(fix[F_D2:F_REPORTED], figures)
     # A reject that is not far off, that agrees with the one before, or is one of many, is no outlier: something is
     # noisier than it says. Unless it is turned, as flips are.
-    far = _length(figures, F_INNOVATION - F_D2) > OUTLIER_DISTANCE
-    turned = _length(figures, F_INNOVATION - F_D2 + 3) > prm[REINIT_ANGLE]
+    far = _length(figures[F_INNOVATION - F_D2 :]) > OUTLIER_DISTANCE
+    turned = _length(figures[F_INNOVATION - F_D2 + 3 :]) > prm[REINIT_ANGLE]
     s[REJECTED_RUN] += 1.0
     if agrees or not (far or turned) or s[REJECTED_RUN] >= prm[REINIT_COUNT]:
         _adapt(s, prm, figures, 0.0 if turned else MOST_TAUGHT)
@@ -732,25 +769,28 @@ def _judge(s, prm, fix):
     if agrees:
         s[SHADOW_COUNT] += 1.0
         # Is the shadow's attitude what the gyro made of the attitude since the last accepted fix?
-        _rotation_vector(s, MAIN, s, SHADOW, y, 0)
+        turn, covariance = np.empty(3), np.empty((3, 3))
+        _rotation_vector(s, s[SHADOW:], turn)
         for i in range(3):
             for j in range(3):
-                S[i, j] = s[COV + N * i + j] + s[SHADOW + COV + N * i + j]
-        angle = _length(y, 0)
-        as_gyro = _distance(S, y, 0, 3)[0] <= prm[GATE_BLOCK] or (
+                covariance[i, j] = s[COV + N * i + j] + s[SHADOW + COV + N * i + j]
+        angle = _length(turn)
+        d2 = np.empty(2)
+        _distance(covariance, turn, d2)
+        as_gyro = d2[0] <= prm[GATE_BLOCK] or (
             # with noise set too small nothing ever agrees; a map entry is not wrong by a little
             s[SHADOW_COUNT] >= 2.0 * prm[REINIT_COUNT] and angle <= prm[REINIT_ANGLE]
         )
         take = s[SHADOW_COUNT] >= prm[REINIT_COUNT] and (as_gyro or patient or not known)
     else:
-        s[SHADOW:AUX] = s[MAIN:SHADOW]
+        _fill(s[SHADOW:AUX], s)
         # A filter that only its first fixes vouch for has no biases worth keeping.
-        _start(s, SHADOW, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
+        _start(s[SHADOW:AUX], prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
         s[SHADOW_COUNT] = 1.0
         # Not even with each other do they agree, so many in a row: then any is better than none of them.
         take = patient or (s[REJECTED_RUN] >= 2.0 * prm[REINIT_COUNT] and not turned)
     if take:
-        s[MAIN:SHADOW] = s[SHADOW:AUX]
+        _fill(s[:SHADOW], s[SHADOW:])
         s[ACCEPTED_COUNT] = s[SHADOW_COUNT]
         s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
         s[RESET_ID] += 1.0
@@ -837,8 +877,8 @@ def _constrain(s, prm):
     wheels = prm[MOTION] == DIFFERENTIAL
     for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
         m, sideways = 0, 0
-        H, y, R = np.zeros((9, N)), np.zeros(9), np.zeros((9, 9))
-        _matrix(s, o, B)
+        H, y, variances = np.zeros((9, N)), np.zeros(9), np.empty(9)
+        _matrix(s[o:], B)
         # along body axes: v_b = Rᵀv, δv_b = δv + [v_b]x δθ
         body = np.zeros(3)
         for i in range(3):
@@ -856,7 +896,7 @@ def _constrain(s, prm):
                 if s[o + COV + (N + 1) * (DV + i)] < 1e-3 * variance:
                     continue
             y[m] = -body[i]
-            R[m, m] = variance
+            variances[m] = variance
             H[m, DV + i] = 1.0
             H[m, (i + 1) % 3] = -body[(i + 2) % 3]
             H[m, (i + 2) % 3] = body[(i + 1) % 3]
@@ -865,7 +905,7 @@ def _constrain(s, prm):
             sigma = 2.0 * prm[GYRO_NOISE] * math.sqrt(GRID_HZ)
             for i in range(3):
                 y[m] = s[STILL_MEAN + i] - s[o + BG + i]
-                R[m, m] = sigma * sigma
+                variances[m] = sigma * sigma
                 H[m, DBG + i] = 1.0
                 m += 1
         if prm[MOTION] != FREE:
@@ -873,29 +913,31 @@ def _constrain(s, prm):
             y[m] = -s[o + V + 2]
             for i in range(3):
                 H[m, DV + i] = B[2, i]
-            R[m, m] = _loosened(prm[GROUND_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS], y[m])
+            variances[m] = _loosened(prm[GROUND_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS], y[m])
             m += 1
             # up in body axes, u = Rᵀe_z, is (0, 0, 1): δu = [u]x δθ
             y[m], y[m + 1] = -B[2, 0], -B[2, 1]
             H[m, 1], H[m, 2] = -B[2, 2], B[2, 1]
             H[m + 1, 0], H[m + 1, 2] = B[2, 2], -B[2, 0]
             for i in range(1, 3):
-                R[m, m] = _loosened(prm[GROUND_TILT_SIGMA] ** 2, s[CONSTRAINT_NIS + i], y[m])
+                variances[m] = _loosened(prm[GROUND_TILT_SIGMA] ** 2, s[CONSTRAINT_NIS + i], y[m])
                 m += 1
         if o == MAIN and prm[MOTION] != FREE and not still:
             first = m - 3
             for i in range(4 if wheels else 3):
                 a = first + i if i < 3 else sideways
-                expected = R[a, a]
-                for c in range(N):
-                    for d in range(N):
-                        if H[a, c] != 0.0 and H[a, d] != 0.0:
-                            expected += H[a, c] * s[o + COV + N * c + d] * H[a, d]
+                expected = variances[a]
+                for c in range(DP):  # of attitude and velocity only
+                    for d in range(DP):
+                        expected += H[a, c] * s[COV + N * c + d] * H[a, d]
                 # relative to the constraint as it was meant
                 loose = max(s[CONSTRAINT_NIS + i], 1.0)
                 s[CONSTRAINT_NIS + i] += 0.05 * (min(y[a] * y[a] / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
         if m > 0:
-            update(s, o, H[:m], y[:m], R[:m, :m])
+            R = np.zeros((m, m))
+            for i in range(m):
+                R[i, i] = variances[i]
+            update(s[o : o + BLOCK], H[:m], y[:m], R)
 
 
 # -------------------------------------------------------------------------------------------------------- timeline
@@ -1085,7 +1127,7 @@ def _insert_sample(s, prm, imu, checkpoints, meta, samples, row):
         if not replaces:
             return False
     if (replaces or place < end or not _precedes_sample(s, t, prm[IMU_GAP])) and not _rewind(
-        s, prm, checkpoints, meta, t, -1
+        s, prm, checkpoints, meta, t, -1.0
     ):
         meta[IMU_LATE] += 1.0
         return False
@@ -1123,11 +1165,12 @@ def _insert_fix(s, prm, fixes, checkpoints, meta, fix):
         if order < 0:
             break
         place -= 1
-    if not _precedes_fix(s, fix[F_T], place) and not _rewind(s, prm, checkpoints, meta, fix[F_T], place):
+    number = float(place)
+    if not _precedes_fix(s, fix[F_T], number) and not _rewind(s, prm, checkpoints, meta, fix[F_T], number):
         return TOO_LATE
     for k in range(end, place, -1):
-        fixes[k & FIX_MASK] = fixes[(k - 1) & FIX_MASK]
-    fixes[place & FIX_MASK] = fix
+        _fill(fixes[k & FIX_MASK], fixes[(k - 1) & FIX_MASK])
+    _fill(fixes[place & FIX_MASK], fix)
     meta[FIX_END] = end + 1
     meta[HORIZON] = max(meta[HORIZON], fix[F_T])
     if end + 1 - first == FIX_CAPACITY:
@@ -1140,7 +1183,7 @@ def _insert_fix(s, prm, fixes, checkpoints, meta, fix):
 def _write_pose(s, out):
     """A whole pose, see the P_ constants. Covariances are turned from body into world axes."""
     B = np.empty((3, 3))
-    _matrix(s, MAIN, B)
+    _matrix(s, B)
     out[P_T] = s[T]
     for i in range(3):
         out[P_POS + i] = s[POS + i]
@@ -1172,48 +1215,61 @@ def _write_pose(s, out):
 
 
 @_jit
-def _rotate(rotation, r, q, at):
-    """q[at:at+4] <- Exp(rotation[r:r+3]) q[at:at+4]."""
-    x, y, z = rotation[r], rotation[r + 1], rotation[r + 2]
+def _rotate(rotation, q):
+    """q[:4] <- Exp(rotation[:3]) q[:4]."""
+    x, y, z = rotation[0], rotation[1], rotation[2]
     angle = math.sqrt(x * x + y * y + z * z)
     w, h = math.cos(0.5 * angle), (0.5 if angle < 1e-9 else math.sin(0.5 * angle) / angle)
     x, y, z = h * x, h * y, h * z
-    a, b, c, d = q[at], q[at + 1], q[at + 2], q[at + 3]
-    q[at] = w * a - x * b - y * c - z * d
-    q[at + 1] = w * b + x * a + y * d - z * c
-    q[at + 2] = w * c - x * d + y * a + z * b
-    q[at + 3] = w * d + x * c - y * b + z * a
+    a, b, c, d = q[0], q[1], q[2], q[3]
+    q[0] = w * a - x * b - y * c - z * d
+    q[1] = w * b + x * a + y * d - z * c
+    q[2] = w * c - x * d + y * a + z * b
+    q[3] = w * d + x * c - y * b + z * a
 
 
 @_jit
-def _left(ch, i, dt):
-    """What is left of E after dt s, as a factor, of its position (i = 0) or its rotation (1)."""
-    size2 = ch[E + 3 * i] ** 2 + ch[E + 3 * i + 1] ** 2 + ch[E + 3 * i + 2] ** 2
-    if dt <= 0.0 or size2 == 0.0:
+def _left(e, dt, speed):
+    """What is left of half of E, e[:3], after dt s at no more than `speed`, as a factor.
+
+    It shrinks at that speed until the exponential is slower: in one step or in many, the same.
+    """
+    size = _length(e)
+    if dt <= 0.0 or size == 0.0:
         return 1.0
-    most = (SMOOTH_SPEED if i == 0 else SMOOTH_RATE) * dt
-    return 1.0 - min(1.0 - math.exp(-dt / SMOOTH_TIME), most / math.sqrt(size2))
+    knee = min(speed * SMOOTH_TIME, size)
+    straight = (size - knee) / speed
+    if dt <= straight:
+        return 1.0 - speed * dt / size
+    return knee / size * math.exp((straight - dt) / SMOOTH_TIME)
 
 
 @_jit
-def _move(out, position, quaternion, ch, dt):
+def _move(position, quaternion, ch, dt):
     """Move a pose of the filter by what is left of E after dt s."""
-    turn = np.empty(3)
+    shift, turn = _left(ch[E:], dt, SMOOTH_SPEED), _left(ch[E + 3 :], dt, SMOOTH_RATE)
+    rotation = np.empty(3)
     for i in range(3):
-        out[position + i] += _left(ch, 0, dt) * ch[E + i]
-        turn[i] = _left(ch, 1, dt) * ch[E + 3 + i]
-    _rotate(turn, 0, out, quaternion)
+        position[i] += shift * ch[E + i]
+        rotation[i] = turn * ch[E + 3 + i]
+    _rotate(rotation, quaternion)
 
 
 @_jit
 def _absorb(s, ch, plain):
     """Set E such that the smooth pose does not move by what an input has done to the filter's."""
+    moved = False
+    for i in range(6):
+        moved |= s[CORRECTED + i] != ch[BEFORE_CORRECTED + i]
+    if plain and not moved:
+        return
     # Where both would have been at the latest instant that is known outside.
     at = s[T] if plain else min(max(ch[E_PUBLISHED], s[T]), s[T] + SMOOTH_REACH)
     if at > ch[E_T]:
-        position, rotation = _left(ch, 0, at - ch[E_T]), _left(ch, 1, at - ch[E_T])
+        shift = _left(ch[E:], at - ch[E_T], SMOOTH_SPEED)
+        rotation = _left(ch[E + 3 :], at - ch[E_T], SMOOTH_RATE)
         for i in range(3):
-            ch[E + i] *= position
+            ch[E + i] *= shift
             ch[E + 3 + i] *= rotation
         ch[E_T] = at
     if plain:
@@ -1231,15 +1287,15 @@ def _absorb(s, ch, plain):
             new[i] = s[Q + i] if i == 0 else -s[Q + i]
         for i in range(3):
             turn[i] = -turn[i]
-        _rotate(turn, 0, old, 0)
+        _rotate(turn, old)
         for i in range(3):
             turn[i] = 0.0 if s[BRIDGING] > 0.0 else -(s[U + i] - s[BG + i]) * (at - s[T])
-        _rotate(turn, 0, new, 0)
+        _rotate(turn, new)
         for i in range(3):
             old[1 + i] = -old[1 + i]
             e = ch[BEFORE + 1 + i] + ch[BEFORE + 8 + i] * (at - ch[BEFORE])
             ch[E + i] += e - s[POS + i] - s[V + i] * (at - s[T])
-        _rotate(ch, E + 3, old, 0)
+        _rotate(ch[E + 3 :], old)
         # Exp(E') = Exp(E) old newᵀ; new stands conjugated already
         w = old[0] * new[0] - old[1] * new[1] - old[2] * new[2] - old[3] * new[3]
         x = old[0] * new[1] + old[1] * new[0] + old[2] * new[3] - old[3] * new[2]
@@ -1278,14 +1334,15 @@ def process(memory, task, channel, t, inputs, outputs):
     a = META
     b = a + PARAMS
     c = b + STATE
-    ch = memory[c : c + CHANNEL]
+    ch = carray(_pointer(memory + 8 * c), CHANNEL)
     c += CHANNEL
     d = c + IMU_CAPACITY * 7
     e = d + FIX_CAPACITY * FIX
-    meta, prm, state = memory[:a], memory[a:b], memory[b : c - CHANNEL]
-    imu = memory[c:d].reshape((IMU_CAPACITY, 7))
-    fixes = memory[d:e].reshape((FIX_CAPACITY, FIX))
-    checkpoints = memory[e:].reshape((CP_CAPACITY, STATE))
+    meta, prm = carray(_pointer(memory), META), carray(_pointer(memory + 8 * a), PARAMS)
+    state = carray(_pointer(memory + 8 * b), STATE)
+    imu = carray(_pointer(memory + 8 * c), (IMU_CAPACITY, 7))
+    fixes = carray(_pointer(memory + 8 * d), (FIX_CAPACITY, FIX))
+    checkpoints = carray(_pointer(memory + 8 * e), (CP_CAPACITY, STATE))
 
     answer = 0
     s = state
@@ -1335,7 +1392,7 @@ def process(memory, task, channel, t, inputs, outputs):
             for j in range(4):
                 outputs[i, 4 + j] = s[Q + j] if s[INITIALISED] > 0.0 else math.nan
             if channel == SMOOTH:
-                _move(outputs[i], 1, 4, ch, 0.0)
+                _move(outputs[i, 1:], outputs[i, 4:], ch, s[T] - ch[E_T])
     if live:
         return answer
     # On from the last sample: between two samples as ever; beyond them with the last input as long as it is fresh,
@@ -1345,11 +1402,11 @@ def process(memory, task, channel, t, inputs, outputs):
     for leg in range(1 if between else 2):
         t_leg = t
         if between:
-            s[NEXT_T : NEXT_T + 7] = imu[k & IMU_MASK]
+            _fill(s[NEXT_T : NEXT_T + 7], imu[k & IMU_MASK])
             s[BRIDGING] = 1.0 if s[NEXT_T] - s[T_IMU] > prm[IMU_GAP] else 0.0
         else:
             s[NEXT_T] = math.inf
-            s[NEXT_U : NEXT_U + 6] = s[U : U + 6]
+            _fill(s[NEXT_U : NEXT_U + 6], s[U:])
             # Later than that nothing is known, and the pose stays where it was.
             t_leg = min(t, s[T] + SPEED_TIME) if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
         if t_leg > s[T] and s[INITIALISED] + fix_end > 0.0:
@@ -1366,12 +1423,15 @@ def process(memory, task, channel, t, inputs, outputs):
             out[P_STEP + i] = ch[E_STEP + i]
         if t >= state[T]:
             ch[E_PUBLISHED] = max(ch[E_PUBLISHED], t)
-            _move(out, P_POS, P_QUAT, ch, t - ch[E_T])
+            _move(out[P_POS:], out[P_QUAT:], ch, t - ch[E_T])
             # E is known, and not the filter's error: what is left of it adds to the second moment.
+            left = np.empty(6)
+            for i in range(3):
+                left[i] = out[P_POS + i] - s[POS + i]
+                left[3 + i] = _left(ch[E + 3 :], t - ch[E_T], SMOOTH_RATE) * ch[E + 3 + i]
             for i in range(6):
                 for j in range(6):
-                    left = _left(ch, i // 3, t - ch[E_T]) * _left(ch, j // 3, t - ch[E_T])
-                    out[P_COV + 6 * i + j] += left * ch[E + i] * ch[E + j]
+                    out[P_COV + 6 * i + j] += left[i] * left[j]
     return 1
 
 

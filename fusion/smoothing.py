@@ -54,10 +54,17 @@ class Smoother:
         dt = t - self._t
         if dt <= 0.0:
             return self._e
-        decay = 1.0 - math.exp(-dt / k.SMOOTH_TIME)
         left = []
-        for x, y, z, most in ((*self._e[:3], k.SMOOTH_SPEED * dt), (*self._e[3:], k.SMOOTH_RATE * dt)):
-            share = 1.0 - min(decay, most / max(math.sqrt(x * x + y * y + z * z), most))
+        for x, y, z, speed in ((*self._e[:3], k.SMOOTH_SPEED), (*self._e[3:], k.SMOOTH_RATE)):
+            size = math.hypot(x, y, z)
+            # at the greatest speed until the exponential is slower
+            knee = min(speed * k.SMOOTH_TIME, size)
+            straight = (size - knee) / speed
+            share = 1.0
+            if 0.0 < dt <= straight:
+                share = 1.0 - speed * dt / size
+            elif size > 0.0:
+                share = knee / size * math.exp((straight - dt) / k.SMOOTH_TIME)
             left += [share * x, share * y, share * z]
         return left
 

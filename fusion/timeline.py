@@ -47,6 +47,7 @@ class Timeline:
     def __init__(self, params: FilterParams, motion: Motion) -> None:
         self._memory = k.new_memory(parameter_vector(params, motion))
         self._meta, _, self._state, _, _, self._fixes, _ = k.views(self._memory)
+        self._address = self._memory.ctypes.data
         self._nothing = np.zeros((0, 8))
         self._waiting = 0  # fixes in the ring whose outcome has not been told
 
@@ -62,11 +63,11 @@ class Timeline:
         late), position, quaternion wxyz; NaN before the first fix.
         """
         outputs = self._nothing if track is None else track
-        return int(k.process(self._memory, k.FEED_SAMPLES, CHANNELS[channel], 0.0, samples, outputs))
+        return int(k.process(self._address, k.FEED_SAMPLES, CHANNELS[channel], 0.0, samples, outputs))
 
     def feed_fix(self, row: Array) -> int:
         """A fix as `fix_row` makes it. -> `kernels.PENDING`, `TOO_LATE` or `DUPLICATE`."""
-        status = int(k.process(self._memory, k.FEED_FIX, k.BEST, 0.0, row[np.newaxis], self._nothing))
+        status = int(k.process(self._address, k.FEED_FIX, k.BEST, 0.0, row[np.newaxis], self._nothing))
         if status == k.PENDING:
             self._waiting += 1
         return status
@@ -89,7 +90,7 @@ class Timeline:
     def pose_at(self, t: float, channel: Channel = "best") -> Array | None:
         """A pose (kernels.POSE,) for instant t; None before the first fix, or before the buffer."""
         out = np.zeros((1, k.POSE))
-        return out[0] if k.process(self._memory, k.POSE_AT, CHANNELS[channel], t, self._nothing, out) else None
+        return out[0] if k.process(self._address, k.POSE_AT, CHANNELS[channel], t, self._nothing, out) else None
 
     @property
     def figures(self) -> dict[str, int]:

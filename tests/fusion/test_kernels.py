@@ -207,7 +207,7 @@ def test_update_is_the_textbook_one_and_keeps_a_covariance():
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     dx = K @ y
     before = s.copy()
-    assert k.update(s, 0, H, y, R)
+    assert k.update(s[: k.BLOCK], H, y, R)
     np.testing.assert_allclose(error(before, s), dx, atol=1e-12)
     # the error about the new state, by differences of its definition
     J = np.empty((k.N, k.N))
@@ -225,5 +225,5 @@ def test_update_is_the_textbook_one_and_keeps_a_covariance():
 def test_update_refuses_what_is_no_covariance():
     s = some_state(np.random.default_rng(6))
     before = s.copy()
-    assert not k.update(s, 0, np.eye(6, k.N), np.ones(6), -np.eye(6))
+    assert not k.update(s[: k.BLOCK], np.eye(6, k.N), np.ones(6), -np.eye(6))
     np.testing.assert_array_equal(s, before)

@@ -59,7 +59,7 @@ def test_kernels_equal_filterpy(motion, seed):
             assert a.hypothesis == b.hypothesis
             seen.add(a.outcome.name)
         if engines[0].started:
-            a, b = (engine._timeline.state[: k.SHADOW] for engine in engines)
+            a, b = (engine._timeline.state[: k.CORRECTED] for engine in engines)
             b[: k.V] *= np.sign(a[: k.V] @ b[: k.V])  # q and -q are the same rotation
             np.testing.assert_allclose(a, b, atol=1e-9)
     assert {"INITIALISED", "ACCEPTED", "REJECTED", "REINITIALISED"} <= seen
