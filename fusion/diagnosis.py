@@ -8,6 +8,7 @@ rotation between fixes with the gyroscope's. Where an IMU is wrong altogether it
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from fusion.geometry import rotation_from_quaternion
 from fusion.localiser import Localiser
 from fusion.measurements import Array, FixOutcome, Outcome, PoseHypothesis
 from fusion.params import GRAVITY
@@ -44,7 +46,14 @@ REPEATS_LEAST = 0.01
 LIMIT_LEAST, LIMIT_SAMPLES, LIMIT_RATIO = (2.0, 15.0), 20, 2.0
 FORCE_RANGE = (0.7 * GRAVITY, 1.3 * GRAVITY)  # m/s2: median specific force
 GRAVITY_ANGLE = math.radians(20.0)
+GYRO_NOISE_MOST = 0.01  # rad/s/sqrt(Hz), of a working one: twenty times a bad one's datasheet
 TURN_LEAST, TURN_PAIRS, TURN_STEP = 3.0, 8, 0.3  # rad, number, s: rotation between fixes that can judge a gyroscope
+UNIT_LEAST, UNIT_SIGMAS = 15.0, 8.0  # times what the fixes turn; of the correlation, which needs no large rotation then
+STAMP_STEP = 0.5  # s: no IMU is slower
+CLOCKS_LEAST = 60.0  # s between the stamps of the IMU and of fixes
+# An offset of a marker or of the IMU on the robot: m; sigmas; its share of the innovations; fixes in all, of a marker.
+PLACE_LEAST, PLACE_SIGMAS, PLACE_SHARE, PLACE_FIXES, PLACE_GROUP = 0.015, 7.0, 0.15, 30, 10
+PLACE_TURN = math.radians(2.0)
 LATE_SHARE, LATE_FIXES, LATE_OF_BUFFER = 0.01, 3, 0.8
 NO_FIX = 5.0  # s
 RESETS = 2
@@ -74,14 +83,16 @@ class Diagnosis:
     @property
     def key(self) -> tuple[str, str]:
         """The same for the same trouble, whatever its numbers."""
-        return self.code, str(self.evidence.get("source", ""))
+        return self.code, " ".join(str(self.evidence[name]) for name in ("source", "markers") if name in self.evidence)
 
 
 class JudgedFix(NamedTuple):
-    """A fix, its outcome, and the pose (7,) published for it; the last fix in that; how far it was off, m and rad."""
+    """A fix: its outcome, the pose of it that was used, its markers; the pose (7,) published for it; the last fix in
+    that; how far it was off, m and rad."""
 
     outcome: FixOutcome
     pose: PoseHypothesis
+    markers: tuple[int, ...]
     published: Array | None
     used: float
     distance: float
@@ -104,10 +115,18 @@ class Chunk(NamedTuple):
     blocks: Array
 
 
+class Turns(NamedTuple):
+    """Between fixes, what they turn (n, 3) and what the gyroscope does, rad."""
+
+    fixes: Array
+    gyro: Array
+
+
 class Seen(NamedTuple):
     """All that a diagnosis looks at: of `WINDOW` before `now`, on the clock of the stamps.
 
-    `began`: stamp of the first sample, NaN before it. `fixes`: judged ones, by stamp. `lost`: how many came too late.
+    `began`: stamp of the first sample, NaN before it. `stamps`: earliest and latest stamp of a fix ever, inf and -inf
+    before one. `fixes`: judged ones, by stamp. `lost`: how long after its stamp each arrived that came too late, s.
     `learned`: now and then the time and the filter's noise scale.
     """
 
@@ -115,8 +134,9 @@ class Seen(NamedTuple):
     localiser: Localiser
     began: float
     chunks: Sequence[Chunk]
+    stamps: tuple[float, float]
     fixes: Sequence[JudgedFix]
-    lost: int
+    lost: Sequence[float]
     learned: Sequence[tuple[float, Array]]
 
 
@@ -126,22 +146,30 @@ def diagnose(seen: Seen) -> list[Diagnosis]:
     found: list[Diagnosis] = []
     if seen.chunks:
         blocks = np.concatenate([chunk.blocks for chunk in seen.chunks])
-        found += [*_of_samples(seen, blocks), *_of_imu_and_fixes(fixes, blocks), *_of_rest(seen, blocks)]
+        turns = _turns(fixes, blocks)
+        gyro = list(_of_gyro(turns))
+        in_doubt = not gyro and (turns is None or _agreement(turns) < 0.8)
+        found += [*_of_samples(seen, blocks, in_doubt), *_of_gravity(fixes, blocks), *gyro, *_of_rest(seen, blocks)]
     found += _of_arrivals(seen)
     codes = {diagnosis.code for diagnosis in found}
-    if codes & _ROOTS:
-        # Much else is wrong then, but nothing of it is the cause.
-        return [diagnosis for diagnosis in found if diagnosis.code in _ROOTS or diagnosis.code in _BESIDES]
+    for causes, besides in (({"imu_stamp_unit"}, set()), ({"fixes_clock"}, set()), (_ROOTS, _BESIDES)):
+        if codes & causes:
+            # Much else is wrong then, but nothing of it is the cause.
+            return [diagnosis for diagnosis in found if diagnosis.code in causes | besides]
     odd = [*_of_turns(fixes), *_of_cameras(fixes, 2 if planar else 3)]
-    if not odd:
+    places = list(_of_places(seen, 2 if planar else 3))
+    if not odd and not places:
         found += _of_learned(seen, codes)
-    # Where noise is understated, so are the filter's sigmas.
-    understated = max([1.0, *(diagnosis.evidence["times"] for diagnosis in found if "noise" in diagnosis.code)])
-    return [*found, *odd, *_of_states(seen.localiser, understated)]
+    if not places:
+        # Where noise is understated, so are the filter's sigmas, also of what it has come to take for noise.
+        noise = [diagnosis.evidence["times"] for diagnosis in found if diagnosis.code.endswith("_noise")]
+        understated = max([1.0, *noise, *seen.localiser.noise_scale.tolist()])
+        found += _of_states(seen.localiser, understated)
+    return [*found, *odd, *places]
 
 
-def _of_samples(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
-    """Of the IMU alone: what is missing, clipped, noisy or in the wrong unit."""
+def _of_samples(seen: Seen, blocks: Array, in_doubt: bool) -> Iterator[Diagnosis]:
+    """Of the IMU alone: what is missing, clipped, noisy or in the wrong unit. `in_doubt`: the gyroscope's unit."""
     chunks = seen.chunks
     samples, missing = sum(c.samples for c in chunks), sum(c.missing for c in chunks)
     gaps, longest = sum(c.gaps for c in chunks), max(c.longest for c in chunks)
@@ -157,6 +185,10 @@ def _of_samples(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
         yield Diagnosis("imu_stamps_repeat", "warning", text, {"share": repeats, "samples": samples})
 
     step = float(np.median([chunk.step for chunk in chunks]))
+    if STAMP_STEP <= step < math.inf:
+        unit = next(unit for unit, least in (("nano", 1e5), ("micro", 1e2), ("milli", 0.0)) if step >= least)
+        text = f"the IMU's samples are {step:.4g} s apart by their stamps: these are {unit}seconds, not seconds"
+        yield Diagnosis("imu_stamp_unit", "error", text, {"step": step, "samples": samples})
     mean, by_first, by_third = blocks[:, 2:8], blocks[:, 8:14], blocks[:, 14:20]
     limit = np.max([chunk.top for chunk in chunks], axis=0)
     for (name, sensor, unit, axes), least in zip(_SENSORS, LIMIT_LEAST, strict=True):
@@ -180,7 +212,11 @@ def _of_samples(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
             if noise >= NOISE_LEAST * configured and sigmas >= SIGMAS:
                 text = f"the {sensor} is about {noise / configured:.1f} x noisier than configured ({name}_noise)"
                 evidence = {"times": noise / configured, "noise": noise, "configured": configured, "sigmas": sigmas}
-                yield Diagnosis(f"{name}_noise", "warning", text, evidence)
+                if name == "gyro" and in_doubt and noise >= GYRO_NOISE_MOST:
+                    text += ", and than any that works: is its unit deg/s, not rad/s?"
+                    yield Diagnosis("gyro_unit", "error", text, evidence)
+                else:
+                    yield Diagnosis(f"{name}_noise", "warning", text, evidence)
     if len(blocks) >= NOISE_BLOCKS:
         force = float(np.median(np.linalg.norm(mean[:, 3:], axis=1)))
         if not FORCE_RANGE[0] < force < FORCE_RANGE[1]:
@@ -194,7 +230,15 @@ def _of_samples(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
 
 def _of_arrivals(seen: Seen) -> Iterator[Diagnosis]:
     """Of when fixes come, and whether they are of use."""
-    localiser, fixes, lost, last = seen.localiser, seen.fixes, seen.lost, seen.localiser.last_fix
+    localiser, fixes, lost, last = seen.localiser, seen.fixes, len(seen.lost), seen.localiser.last_fix
+    apart = 0.0
+    if seen.chunks:
+        apart = max(seen.stamps[0] - seen.chunks[-1].t, seen.began - seen.stamps[1])
+    if lost >= LATE_FIXES:
+        apart = max(apart, float(np.median(seen.lost)))
+    if CLOCKS_LEAST <= apart < math.inf:
+        text = f"the stamps of the fixes and of the IMU are {apart:.4g} s apart: two clocks, or two units?"
+        yield Diagnosis("fixes_clock", "error", text, {"apart_s": apart})
     age = seen.now - (last if math.isfinite(last) else seen.began)
     if age >= NO_FIX:
         ignored = sum(fix.outcome.t > last and fix.outcome.outcome is Outcome.REJECTED for fix in fixes)
@@ -250,11 +294,11 @@ def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
     # Nor do the blocks around it: within one, a start can hide.
     still = calm & np.append(calm[1:], False) & np.append(False, calm[:-1])
     moving = np.concatenate([[0], np.cumsum(~still)])
-    by_source: dict[str, list[JudgedFix]] = {}
+    groups: dict[tuple[str, tuple[int, ...]], list[JudgedFix]] = {}
     for fix in seen.fixes:
         if not _is_turned(fix):
-            by_source.setdefault(fix.outcome.source, []).append(fix)
-    for source, own in by_source.items():
+            groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
+    for (source, markers), own in groups.items():
         t = np.array([fix.outcome.t for fix in own]) + seen.localiser.time_offset
         first, last = np.searchsorted(blocks[:, 1], t[:-1]), np.searchsorted(blocks[:, 0], t[1:], side="right")
         rest = (last > first) & (moving[last] == moving[first]) & (last <= len(blocks)) & (t[1:] <= blocks[-1, 1])
@@ -273,10 +317,10 @@ def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
             times = float(np.median(np.abs(e))) / 0.6745
             sigmas = (times - 1.0) * math.sqrt(e.size) / 1.4
             if e.size >= REST_RESIDUALS and times >= NOISE_LEAST and sigmas >= REST_SIGMAS:
-                name = f" of camera {source}" if source else ""
+                name = (f" of camera {source}" if source else "") + (f" by {_named(markers)}" if markers else "")
                 text = f"fixes{name} are about {times:.1f} x less accurate in {block} than they say"
-                evidence = {"source": source, "times": times, "components": e.size, "sigmas": sigmas}
-                yield Diagnosis(f"fix_{block}_noise", "warning", text, evidence)
+                evidence = {"times": times, "components": e.size, "sigmas": sigmas}
+                yield Diagnosis(f"fix_{block}_noise", "warning", text, _origin(source, markers) | evidence)
 
 
 def _of_learned(seen: Seen, known: set[str]) -> Iterator[Diagnosis]:
@@ -322,12 +366,9 @@ def _residuals(t: Array, fixes: Sequence[JudgedFix]) -> Array:
     return residuals
 
 
-def _of_imu_and_fixes(fixes: Sequence[JudgedFix], blocks: Array) -> Iterator[Diagnosis]:
-    """Does the IMU turn as the fixes do, and does its gravity point downwards in them?"""
-    t = np.array([fix.outcome.t for fix in fixes])
-    inside = (t >= blocks[0, 0]) & (t < blocks[-1, 1])
-    t = t[inside]
-    quaternions = np.array([fix.pose.quaternion_wxyz for fix in fixes])[inside]
+def _of_gravity(fixes: Sequence[JudgedFix], blocks: Array) -> Iterator[Diagnosis]:
+    """Does the IMU's gravity point downwards in the fixes?"""
+    t, quaternions = _within(fixes, blocks)
     if len(t) < TURN_PAIRS:
         return
     force = blocks[np.searchsorted(blocks[:, 0], t, side="right") - 1, 5:8]
@@ -346,6 +387,17 @@ def _of_imu_and_fixes(fixes: Sequence[JudgedFix], blocks: Array) -> Iterator[Dia
         evidence = {"angle_deg": math.degrees(angle), "axis": name, "force": force.tolist(), "fixes": len(t)}
         yield Diagnosis("imu_mounting", "error", text, evidence)
 
+
+def _within(fixes: Sequence[JudgedFix], blocks: Array) -> tuple[Array, Array]:
+    """Stamps (n,) and quaternions (n, 4) of the fixes while there are samples."""
+    t = np.array([fix.outcome.t for fix in fixes])
+    inside = (t >= blocks[0, 0]) & (t < blocks[-1, 1])
+    return t[inside], np.array([fix.pose.quaternion_wxyz for fix in fixes]).reshape(-1, 4)[inside]
+
+
+def _turns(fixes: Sequence[JudgedFix], blocks: Array) -> Turns | None:
+    """None where there are too few to judge by."""
+    t, quaternions = _within(fixes, blocks)
     integral = np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(blocks[:, 0])[:, np.newaxis] * blocks[:-1, 2:5], 0)])
     gyro = np.column_stack([np.interp(t, blocks[:, 0], integral[:, i]) for i in range(3)])
     pairs, since = [], 0
@@ -354,25 +406,46 @@ def _of_imu_and_fixes(fixes: Sequence[JudgedFix], blocks: Array) -> Iterator[Dia
             pairs += [(since, i)] if t[i] - t[since] < 5.0 * TURN_STEP else []
             since = i
     if len(pairs) < TURN_PAIRS:
-        return
+        return None
     a, b = np.array(pairs).T
     turned, gyro = _rotation(quaternions[a], quaternions[b]), gyro[b] - gyro[a]
     # Half a turn and more is ambiguous.
     clear = np.linalg.norm(turned, axis=1) < 2.5
-    turned, gyro = turned[clear], gyro[clear]
-    total = float(np.linalg.norm(turned, axis=1).sum())
-    if total < TURN_LEAST:
+    return Turns(turned[clear], gyro[clear]) if clear.sum() >= TURN_PAIRS else None
+
+
+def _agreement(turns: Turns) -> float:
+    """Correlation: 1 where the gyroscope turns as the fixes do, but for a factor; 0 of rest."""
+    total = float(np.linalg.norm(turns.fixes, axis=1).sum())
+    square = float(np.sum(turns.gyro**2)) * float(np.sum(turns.fixes**2))
+    return float(np.sum(turns.fixes * turns.gyro)) / math.sqrt(square + 1e-12) if total >= TURN_LEAST else 0.0
+
+
+def _of_gyro(turns: Turns | None) -> Iterator[Diagnosis]:
+    """Does the IMU turn as the fixes do?"""
+    if turns is None:
         return
-    product, square = float(np.sum(turned * gyro)), float(np.sum(gyro**2))
-    agreement = product / math.sqrt(square * float(np.sum(turned**2)) + 1e-12)
-    times = square / product if product else math.inf
-    evidence = {"times": times, "correlation": agreement, "rotation_deg": math.degrees(total), "pairs": len(turned)}
-    if agreement > 0.8 and times > 20.0:
-        text = f"the gyroscope reads {times:.0f} x what the fixes turn: its unit is deg/s, not rad/s"
-        yield Diagnosis("gyro_unit", "error", text, evidence)
-    elif agreement < -0.8:
-        text = "the gyroscope turns the other way than the fixes: a sign, or the IMU is upside down"
-        yield Diagnosis("gyro_sign", "error", text, evidence)
+    agreement = _agreement(turns)
+    # Of a robot that rests most of the time, its bias is the most of what the gyroscope reads.
+    moved = Turns(turns.fixes - turns.fixes.mean(axis=0), turns.gyro - turns.gyro.mean(axis=0))
+    for fixed, gyro in (turns, moved):
+        product, square, of_fixes = (float(np.sum(a * b)) for a, b in ((fixed, gyro), (gyro, gyro), (fixed, fixed)))
+        sigmas = abs(product) / math.sqrt(square * of_fixes + 1e-12) * math.sqrt(fixed.size)
+        evidence = {
+            "times": square / product if product else math.inf,
+            "correlation": product / math.sqrt(square * of_fixes + 1e-12),
+            "rotation_deg": math.degrees(float(np.linalg.norm(turns.fixes, axis=1).sum())),
+            "pairs": len(fixed),
+        }
+        # The noise of fixes makes this factor too small.
+        if product > UNIT_LEAST * of_fixes and sigmas > UNIT_SIGMAS:
+            text = f"the gyroscope reads {evidence['times']:.0f} x what the fixes turn: its unit is deg/s, not rad/s"
+            yield Diagnosis("gyro_unit", "error", text, evidence)
+            return
+        if agreement < -0.8:
+            text = "the gyroscope turns the other way than the fixes: a sign, or the IMU is upside down"
+            yield Diagnosis("gyro_sign", "error", text, evidence)
+            return
 
 
 def _is_turned(fix: JudgedFix) -> bool:
@@ -382,42 +455,159 @@ def _is_turned(fix: JudgedFix) -> bool:
 
 def _of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
     """Fixes that are far off in attitude: alike about the vertical, or tipped as the other pose of a flat marker is."""
-    by_source: dict[str, list[Array]] = {}
-    count: dict[str, int] = {}
+    groups: dict[tuple[str, tuple[int, ...]], list[JudgedFix]] = {}
     for fix in fixes:
-        outcome = fix.outcome
-        count[outcome.source] = count.get(outcome.source, 0) + 1
-        if _is_turned(fix):
-            by_source.setdefault(outcome.source, []).append(outcome.innovation[3:])
-    for source, turns in by_source.items():
-        name = f"camera {source}" if source else "the camera"
-        turn = np.array(turns)
+        groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
+    turned: list[tuple[str, dict[str, Any]]] = []
+    for (source, markers), own in groups.items():
+        turn = np.array([fix.outcome.innovation[3:] for fix in own if _is_turned(fix)]).reshape(-1, 3)
+        if not len(turn):
+            continue
         angle = np.linalg.norm(turn, axis=1)
         upright = np.abs(turn[:, 2]) / angle
         about_z = turn[upright > 0.9, 2]
         mean = np.mean(np.exp(1j * about_z)) if about_z.size else 0.0
+        evidence = _origin(source, markers)
         if about_z.size >= TURNED_FIXES and abs(mean) >= TURNED_AGREE:
             degrees = abs(math.degrees(float(np.angle(mean))))
-            text = (
-                f"{name} gives fixes turned by {degrees:.0f} deg: {about_z.size} of {count[source]} agree in that; "
-                "is a marker mounted or entered turned?"
-            )
-            evidence = {
-                "source": source,
-                "turn_deg": degrees,
-                "fixes": int(about_z.size),
-                "agreement": float(abs(mean)),
-            }
-            yield Diagnosis("fixes_turned", "warning", text, evidence)
+            evidence |= {"turn_deg": degrees, "fixes": int(about_z.size), "agreement": float(abs(mean)), "of": len(own)}
+            turned.append((_named(markers) or (f"camera {source}" if source else "the camera"), evidence))
         tipped = angle[upright < 0.7]
         if tipped.size >= TURNED_FIXES:
             degrees = math.degrees(float(np.median(tipped)))
+            name = (f"camera {source}" if source else "the camera") + (f" by {_named(markers)}" if markers else "")
             text = (
-                f"{name} shows the robot tipped by about {degrees:.0f} deg in {tipped.size / count[source]:.0%} of its "
+                f"{name} shows the robot tipped by about {degrees:.0f} deg in {tipped.size / len(own):.0%} of its "
                 "fixes: the other pose of a flat marker; a larger marker or a sharper image helps"
             )
-            evidence = {"source": source, "tip_deg": degrees, "fixes": int(tipped.size), "of": count[source]}
-            yield Diagnosis("fixes_flipped", "note", text, evidence)
+            tip = {"tip_deg": degrees, "fixes": int(tipped.size), "of": len(own)}
+            yield Diagnosis("fixes_flipped", "note", text, {**evidence, **tip})
+    for name, evidence in turned:
+        by = f"{evidence['turn_deg']:.0f} deg"
+        agree = f"{evidence['fixes']} of its {evidence['of']} fixes"
+        if "markers" not in evidence:
+            text = f"{name} gives fixes turned by {by}: {agree} agree in that; is a marker mounted or entered turned?"
+        elif len(turned) > 1:
+            # The filter has believed now the one, now the other.
+            text = f"{name} disagrees with another marker by {by}, in {agree}: one of them is mounted or entered turned"
+        else:
+            text = f"{name} is mounted or entered turned by {by}: {agree} agree in that"
+        yield Diagnosis("fixes_turned", "warning", text, evidence)
+
+
+def _named(markers: tuple[int, ...]) -> str:
+    return f"marker{'s' * (len(markers) > 1)} {' and '.join(map(str, markers))}" if markers else ""
+
+
+def _origin(source: str, markers: tuple[int, ...]) -> dict[str, Any]:
+    return {"source": source} | ({"markers": list(markers)} if markers else {})
+
+
+def _of_places(seen: Seen, axes: int) -> Iterator[Diagnosis]:
+    """Where markers sit on the robot, or its IMU: an offset turns with the robot, and the prediction does not.
+
+    What the filter makes of an offset is linear in it, nearly. That response is worked out for one unit along each
+    axis, and the offsets are those by which it explains the innovations best. They come out too small, since biases
+    take a part of them.
+    """
+    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2)]
+    count = Counter(fix.markers for fix in fixes)
+    groups = [markers for markers, n in count.most_common(4) if n >= PLACE_GROUP]
+    if len(fixes) < PLACE_FIXES or not groups:
+        return
+    group = np.array([groups.index(fix.markers) if fix.markers in groups else -1 for fix in fixes])
+    # Of groups that are too small no offset is worked out, and what came before the first fixes is not known.
+    used = (group >= 0) & (np.arange(len(fixes)) >= 5)
+    innovation = np.array([fix.outcome.innovation for fix in fixes])
+    variance = np.array([fix.outcome.innovation_sigma**2 for fix in fixes])
+    of_fix = np.array([np.diag(fix.pose.covariance) for fix in fixes])
+    looks, scales = np.array([t for t, _ in seen.learned]), np.array([scale for _, scale in seen.learned])
+    arrivals = [fix.outcome.arrival for fix in fixes]
+    for i, axis in enumerate((slice(0, 3), slice(3, 6)), start=2):  # as large as the filter took them for
+        of_fix[:, axis] *= np.maximum(1.0, np.interp(arrivals, looks, scales[:, i]))[:, np.newaxis] ** 2
+
+    effect = np.zeros((len(fixes), 3, axes * len(groups)))
+    world_from_body = np.array([rotation_from_quaternion(fix.pose.quaternion_wxyz) for fix in fixes])
+    for i in range(len(groups)):
+        effect[group == i, :, axes * i : axes * (i + 1)] = world_from_body[group == i, :, :axes]
+    moved = np.einsum("nij,nj->ni", world_from_body, innovation[:, :3])
+    gain = 1.0 - of_fix[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1)
+    response = _response(fixes, effect, gain, True)
+    sigma = np.sqrt(variance[:, :3].mean(axis=1))[:, np.newaxis]
+    offset, covariance, share = _explanation(
+        (response[:, :axes] / sigma[..., np.newaxis])[used], (moved[:, :axes] / sigma)[used]
+    )
+    found = []
+    for i, markers in enumerate(groups):
+        own = slice(axes * i, axes * (i + 1))
+        size = float(np.linalg.norm(offset[own]))
+        sigmas = math.sqrt(float(offset[own] @ np.linalg.solve(covariance[own, own], offset[own])))
+        if share >= PLACE_SHARE and size >= PLACE_LEAST and sigmas >= PLACE_SIGMAS:
+            found.append((size, sigmas, markers, offset[own]))
+    for size, sigmas, markers, by in found:
+        axis = int(np.argmax(np.abs(by)))
+        way = (("back", "right", "down"), ("front", "left", "up"))[int(by[axis] > 0.0)][axis]
+        name = _named(markers) if len(groups) > 1 else "the marker"
+        text = f"{name} sits {1e3 * size:.0f} mm or more farther to the {way} of the robot than is entered"
+        text += ", or the IMU as much to the other side" if len(groups) == len(found) else ""
+        evidence: dict[str, Any] = {"markers": list(markers)} if len(groups) > 1 else {}
+        evidence |= {"mm": (1e3 * by).tolist(), "sigmas": sigmas, "explained": share, "fixes": count[markers]}
+        yield Diagnosis("marker_place", "warning", text, evidence)
+
+    # About the vertical, against the marker that is seen most.
+    effect = (group[:, np.newaxis] == np.arange(1, len(groups)))[:, np.newaxis].astype(np.float64)
+    response = _response(fixes, effect, 1.0 - of_fix[:, 5] / variance[:, 5], False)
+    sigma = np.sqrt(variance[:, 5:])
+    offset, covariance, share = _explanation(
+        (response / sigma[..., np.newaxis])[used], (innovation[:, 5:] / sigma)[used]
+    )
+    for i, markers in enumerate(groups[1:]):
+        turn, sigmas = abs(float(offset[i])), abs(float(offset[i])) / math.sqrt(covariance[i, i])
+        if share >= PLACE_SHARE and PLACE_TURN <= turn < TURNED_LEAST and sigmas >= PLACE_SIGMAS:
+            names, degrees = f"{_named(groups[0])} and {_named(markers)}", math.degrees(turn)
+            text = (
+                f"{names} disagree by {degrees:.1f} deg: one of them is turned on the robot otherwise than is entered"
+            )
+            evidence = {"markers": [*groups[0], *markers], "turn_deg": degrees, "sigmas": sigmas, "explained": share}
+            yield Diagnosis("marker_turn", "warning", text, evidence | {"fixes": count[markers]})
+
+
+def _response(fixes: Sequence[JudgedFix], effect: Array, gain: Array, speeds: bool) -> Array:
+    """(n, a, m): by how much innovations are off, for each of m constants that move fixes by `effect` (n, a, m) a unit.
+
+    By the gain (n,) of each update alone, and where the filter follows with its speed, with the gain for that in a
+    steady state: P. Kalata, "The tracking index", IEEE Transactions on Aerospace and Electronic Systems 20(2), 1984.
+    """
+    gain = np.clip(gain, 0.02, 0.99)
+    of_speed = 2.0 * (2.0 - gain) - 4.0 * np.sqrt(1.0 - gain)
+    moved, speed, before = effect[0].copy(), np.zeros_like(effect[0]), fixes[0].outcome.t
+    response = np.zeros_like(effect)
+    for i, fix in enumerate(fixes):
+        outcome = fix.outcome
+        step = max(outcome.t - before, 1e-3)
+        before = outcome.t
+        moved = moved + step * speed
+        response[i] = effect[i] - moved
+        if outcome.outcome in BELIEVED:
+            moved = moved + gain[i] * response[i]
+            speed = speed + of_speed[i] / step * response[i] if speeds else speed
+        elif outcome.outcome is not Outcome.REJECTED:
+            moved, speed = effect[i].copy(), np.zeros_like(speed)
+    return response
+
+
+def _explanation(A: Array, b: Array) -> tuple[Array, Array, float]:
+    """x (m,) with A x nearest to b, A (n, a, m), b (n, a), its covariance, and the share of b that it explains."""
+    weight = np.ones(len(b))
+    for _ in range(8):  # Huber's weights: a flipped or a strayed fix says little
+        weighted = A * weight[:, np.newaxis, np.newaxis]
+        # A prior of one unit, for what cannot be told from this motion.
+        normal = np.einsum("ijk,ijl->kl", weighted, A) + np.eye(A.shape[2])
+        x = np.linalg.solve(normal, np.einsum("ijk,ij->k", weighted, b))
+        residual = b - A @ x
+        weight = np.minimum(1.0, 3.0 / np.maximum(np.linalg.norm(residual, axis=1), 1e-9))
+    left, whole = (float(np.sum(weight[:, np.newaxis] * r**2)) for r in (residual, b))
+    return x, np.linalg.inv(normal) * max(1.0, left / b.size), 1.0 - left / whole if whole > 0.0 else 0.0
 
 
 def _of_cameras(fixes: Sequence[JudgedFix], axes: int) -> Iterator[Diagnosis]:

@@ -49,12 +49,12 @@ class Health:
         self._end = self._digested = 0
         self._began = self._t_before = math.nan
         self._last_fix = -math.inf
-        self._newest = -math.inf
+        self._oldest, self._newest = math.inf, -math.inf  # stamps of fixes
         self._chunks: deque[Chunk] = deque()
         self._arriving: dict[tuple[str, float, float], tuple[PoseFix, Array | None, float]] = {}
         self._fixes: deque[JudgedFix] = deque(maxlen=400)
         self._learned: deque[tuple[float, Array]] = deque(maxlen=round(WINDOW / LEARNED_STEP))
-        self._late: deque[float] = deque(maxlen=400)
+        self._late: deque[FixOutcome] = deque(maxlen=400)
         self._doubtful: deque[JudgedFix] = deque(maxlen=100)
         self._accuracy: list[deque[JudgedFix]] = [deque(maxlen=400) for _ in range(len(AGES) + 1)]
 
@@ -86,7 +86,7 @@ class Health:
         """A fix that is about to be fed."""
         if fix.t < self._newest:
             self.reordered += 1
-        self._newest = max(self._newest, fix.t)
+        self._oldest, self._newest = min(self._oldest, fix.t), max(self._newest, fix.t)
         self._arriving[fix.source, fix.t, fix.arrival] = (fix, *self._published(fix.t + self.localiser.time_offset))
         if len(self._arriving) > 256:
             del self._arriving[next(iter(self._arriving))]
@@ -98,12 +98,12 @@ class Health:
                 continue
             known = self._arriving.pop((outcome.source, outcome.t, outcome.arrival), None)
             if outcome.outcome is Outcome.TOO_LATE:
-                self._late.append(outcome.arrival)
+                self._late.append(outcome)
             if known is None:
                 continue
             fix, published, used = known
             pose = fix.hypotheses[outcome.hypothesis]
-            self._score(JudgedFix(outcome, pose, published, used, *self._difference(pose, published)))
+            self._score(JudgedFix(outcome, pose, fix.markers, published, used, *self._difference(pose, published)))
             if not self._learned or abs(outcome.arrival - self._learned[-1][0]) >= LEARNED_STEP:
                 self._learned.append((outcome.arrival, self.localiser.noise_scale))
         self._last_fix = self.localiser.last_fix
@@ -163,9 +163,13 @@ class Health:
         self._t_before = float(t[-1])
         forward = steps[steps > 0.0]
         step = float(np.median(forward)) if forward.size else math.inf
-        long = steps[steps > GAP * step]
+        # The rate may change: a step is long beside those around it.
+        usual = np.repeat(np.median(np.resize(steps, (count, BLOCK)), axis=1), BLOCK)[: len(steps)]
+        usual = np.where(usual > 0.0, usual, step)
+        long, beside = steps[steps > GAP * usual], usual[steps > GAP * usual]
         # Jittered stamps make long steps too, but short ones make up for those.
-        missing = max(0.0, min(float(np.sum(np.round(long / step) - 1.0)), float(forward.sum()) / step - len(steps)))
+        absent = float(np.sum(steps / usual)) - int(np.sum(steps > 0.0))
+        missing = max(0.0, min(float(np.sum(np.round(long / beside) - 1.0)), absent))
         # One row an axis: reductions along what lies side by side in memory are several times as fast.
         u = rows[:, _U:_PUBLISHED].T.copy()
         size = np.abs(u)
@@ -248,9 +252,10 @@ class Health:
         self._digest()
         since = now - WINDOW
         fixes = sorted((fix for fix in self._fixes if fix.outcome.arrival > since), key=lambda fix: fix.outcome.t)
-        lost = sum(arrival > since for arrival in self._late)
+        lost = [outcome.delay for outcome in self._late if outcome.arrival > since]
         learned = [look for look in self._learned if look[0] > since]
-        return Seen(now, self.localiser, self._began, self._chunks, fixes, lost, learned)
+        stamps = self._oldest, self._newest
+        return Seen(now, self.localiser, self._began, self._chunks, stamps, fixes, lost, learned)
 
 
 def _percentile(values: Sequence[float], percent: float, scale: float) -> float | None:

@@ -84,10 +84,10 @@ def replay(
             if progress is not None:
                 progress(at)
         if health is not None:
+            health.arrived(fix)
             if fix.arrival >= due:
                 health.diagnoses(fix.arrival)
                 due = fix.arrival + DIAGNOSE_EVERY
-            health.arrived(fix)
         began = time.perf_counter()
         judged = localiser.feed(fix)
         took += time.perf_counter() - began

@@ -21,7 +21,9 @@ from fusion.simulator import (
     CameraParams,
     ImuParams,
     Simulation,
+    Trajectory,
     TriadParams,
+    WrongMarker,
     aggressive,
     figure_eight,
     random_ground,
@@ -89,6 +91,29 @@ def two_cameras(seed, offset):
     )
     named = [replace(fix, source="west") for fix in west.fixes]
     return replace(west, fixes=sorted(named + apart.fixes, key=lambda fix: fix.arrival))
+
+
+def resting(seed):
+    """It moves for 4 s in 45."""
+    return simulate(replace(random_ground(seed), go=4.0, period=45.0), seed, 90.0)
+
+
+def standing(seed):
+    return simulate(Trajectory(np.zeros((3, 1, 3)), np.zeros((3, 1, 3))), seed, 90.0)
+
+
+def in_milliseconds(simulation, imu=True, fix=True):
+    a, b = 1e3 if imu else 1.0, 1e3 if fix else 1.0
+    return fixes(
+        samples(simulation, lambda samples: samples * [a, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
+        lambda fix: replace(fix, t=fix.t * b, arrival=fix.arrival * b),
+    )
+
+
+def marked(seed, degrees=0.0, shift=(0.0, 0.0, 0.0), share=0.25):
+    return drive(
+        seed, camera=CameraParams(wrong=WrongMarker(turn=np.radians(degrees), shift=shift, share=share, run=7.0))
+    )
 
 
 class Fault(NamedTuple):
@@ -167,6 +192,44 @@ FAULTS = {
     "gone": Fault(
         "no_fix", lambda s: replace(drive(s), fixes=[f for f in drive(s).fixes if f.t < 78.0]), "age_s", 11.5, 13.0
     ),
+    "deg/s, mostly at rest": Fault(
+        "gyro_unit", lambda s: samples(resting(s), times(gyro=57.3)), "times", 45, 70, besides=NO_FIX
+    ),
+    "deg/s, always at rest": Fault(
+        "gyro_unit", lambda s: samples(standing(s), times(gyro=57.3)), "times", 45, 70, besides=NO_FIX
+    ),
+    "gyro sign, mostly at rest": Fault(
+        "gyro_sign", lambda s: samples(resting(s), times(gyro=-1.0)), "correlation", -1.0, -0.8, besides=NO_FIX
+    ),
+    "milliseconds": Fault("imu_stamp_unit", lambda s: in_milliseconds(drive(s)), "step", 4.9, 5.1),
+    "milliseconds of the IMU": Fault(
+        "imu_stamp_unit", lambda s: in_milliseconds(drive(s), fix=False), "step", 4.9, 5.1
+    ),
+    "milliseconds of fixes": Fault("fixes_clock", lambda s: in_milliseconds(drive(s), imu=False), "apart_s", 100, 500),
+    "two clocks": Fault(
+        "fixes_clock",
+        lambda s: fixes(drive(s), lambda f: replace(f, t=f.t + 1.7e9, arrival=f.arrival + 1.7e9)),
+        "apart_s",
+        1.6e9,
+        1.8e9,
+    ),
+    "stamps of another clock": Fault(
+        "fixes_clock", lambda s: fixes(drive(s), lambda f: replace(f, t=f.t - 1e4)), "apart_s", 9.9e3, 1.01e4
+    ),
+    "marker turned": Fault("fixes_turned", lambda s: marked(s, 180.0), "turn_deg", 175, 180),
+    "marker turned a little": Fault("marker_turn", lambda s: marked(s, 8.0), "turn_deg", 7.0, 9.5),
+    "marker displaced": Fault("marker_place", lambda s: marked(s, shift=(0.0, 0.08, 0.0)), "mm", 60, 100),
+    "the only marker displaced": Fault(
+        "marker_place", lambda s: marked(s, shift=(0.1, 0.0, 0.0), share=1.0), "mm", 35, 110
+    ),
+    "IMU beside its place": Fault(
+        "marker_place",
+        lambda s: simulate(aggressive(s), s, 90.0, ImuParams(lever_arm=(0.1, 0.0, 0.0))),
+        "mm",
+        15,
+        110,
+        "free",
+    ),
     "wrong scale": Fault(
         "accel_motion",
         lambda s: drive(s, imu=WRONG_ACCEL),
@@ -199,6 +262,20 @@ def check(fault: Fault, seed: int) -> None:
 def test_a_fault_is_named_with_its_number(name):
     for seed in SEEDS.get(name, (0, 1)):
         check(FAULTS[name], seed)
+
+
+def test_a_marker_is_named():
+    for simulation, code in (
+        (marked(0, 180.0), "fixes_turned"),
+        (marked(0, 8.0), "marker_turn"),
+        (marked(0, shift=(0.1, 0.0, 0.0)), "marker_place"),
+    ):
+        (diagnosis,) = watch(simulation).diagnoses(90.0)
+        assert diagnosis.code == code
+        assert "marker 7" in diagnosis.text
+        assert 7 in diagnosis.evidence["markers"]
+    assert "to the front" in diagnosis.text
+    assert diagnosis.evidence["mm"] == pytest.approx([100.0, 0.0], abs=25.0)
 
 
 @pytest.mark.long
