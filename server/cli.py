@@ -20,6 +20,7 @@ COMMANDS = {
     "run": ("server.run", "the service: cameras and IMUs in, poses out; without a configuration a simulated room"),
     "camera": ("server.camera_node", "the node of a remote camera: captures here, for a service elsewhere"),
     "imu-rest": ("server.imu_rest", "an IMU's bias, scatter and mounting, from ten seconds at rest"),
+    "imu-positions": ("server.imu_positions", "an accelerometer's bias and scale, from its six sides"),
     "replay": ("server.replay", "run a recording through the filter again"),
     "markers": ("server.markers", "a sheet of markers to print"),
     "board": ("server.board", "a calibration board to print"),
