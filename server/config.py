@@ -301,7 +301,7 @@ class _Source:
 
     def _unknown(self, path: KeyPath, key: str) -> ConfigError:
         known = _fields(path)
-        nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+        nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
         if nearest:
             right = _right((*path, nearest[0]))
             advice = f'did you mean "{nearest[0]}"' + (f" ({right})?" if right else "?")
