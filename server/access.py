@@ -9,10 +9,15 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import ssl
 from collections.abc import Collection, Mapping
 from urllib.parse import urlsplit
 
 HASHED = "sha256:"
+
+
+class CertificateError(ValueError):
+    """A TLS certificate or key that cannot be used. The text names the file and what would be right."""
 
 
 def token_matches(given: str, configured: str) -> bool:
@@ -76,3 +81,30 @@ def _hostname(host: str) -> str:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return ""
+
+
+def tls(certificate: str, key: str) -> ssl.SSLContext | None:
+    """For a server with this certificate and key, paths of PEM files; None for "". Raises CertificateError."""
+    if not certificate:
+        return None
+    for path, what in ((certificate, "certificate"), (key, "key")):
+        try:
+            with open(path, encoding="ascii") as file:
+                text = file.read()
+        except (OSError, UnicodeDecodeError) as error:
+            reason = (error.strerror or str(error)).lower() if isinstance(error, OSError) else "not a PEM file"
+            raise CertificateError(f"[server] {what}: {path}: {reason}; the README says how to make one") from None
+        begin = "BEGIN CERTIFICATE" if what == "certificate" else "PRIVATE KEY"
+        if begin not in text:
+            raise CertificateError(f"[server] {what}: {path} is no {what}: there is no line with {begin}")
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+
+    def ask() -> str:
+        raise CertificateError(f"[server] key: {key} has a password; `openssl pkey -in {key}` writes it without")
+
+    try:
+        context.load_cert_chain(certificate, key, ask)
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).lower().replace("_", " ")
+        raise CertificateError(f"[server] certificate: {certificate} with the key {key}: {reason}") from None
+    return context

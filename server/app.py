@@ -58,10 +58,11 @@ from server.messages import (
     Imu,
     MessageError,
     Notice,
-    Watch,
     Welcome,
+    decode_hello,
     decode_watch,
 )
+from server.remote_cameras import RemoteCamera
 from server.robots import Recording, Robot
 
 log = logging.getLogger("steadfix")
@@ -456,6 +457,9 @@ class Service:
             for name, robot in self.robots.items():
                 for text in robot.diagnose(time.monotonic()):
                     self._note(name, text)
+            for name, camera in self.cameras.items():
+                for text in camera.news(time.monotonic()):
+                    log.info("camera %s: %s", name, text)
 
     def _note(self, name: str, text: str) -> None:
         """Say what looks wrong with a robot's data: in the log, and to the robot."""
@@ -614,7 +618,7 @@ class Service:
         token = bearer(visitor.headers)
         if not visitor.local:
             if not token and self.config.server.token:
-                token = (await self._hello(visitor, decode_watch, Watch)).token
+                token = (await self._hello(visitor, decode_watch)).token
             await self._admit(visitor, token, self.config.server.token, "[server]")
         robots, rate_hz, channel, format = self._poses_query(query)
         visitor.dialect = Dialect(binary=format == "msgpack")
@@ -676,8 +680,26 @@ class Service:
             room,
         )
 
+    async def _serve_camera(self, visitor: _Visitor) -> None:
+        hello = await self._hello(visitor, camera_hello)
+        camera = self.cameras.get(hello.camera)
+        if camera is None and not visitor.local:
+            raise RefusedError("there is no such camera, or this is not its token")
+        if not isinstance(camera, RemoteCamera):
+            known = ", ".join(name for name, camera in self.cameras.items() if isinstance(camera, RemoteCamera))
+            raise RefusedError(
+                f'there is no remote camera "{hello.camera}" in the configuration (source = "remote"); '
+                f"known: {known or 'none'}"
+            )
+        token = hello.token or bearer(visitor.headers)
+        await self._admit(visitor, token, camera.config.token, f'camera "{hello.camera}"')
+        if taken := camera.refusal(time.monotonic()):
+            raise RefusedError(taken, retry=True)
+        address = _address(visitor.connection)
+        await camera.serve(visitor.connection, address, SERVICE, functools.partial(self._refuse, visitor))
+
     async def _serve_robot(self, visitor: _Visitor) -> None:
-        hello = await self._hello(visitor, Dialect().decode, Hello)
+        hello = await self._hello(visitor, decode_hello)
         visitor.dialect = Dialect(hello, visitor.dialect.binary)
         robot = self.robots.get(hello.robot)
         if robot is None and not visitor.local:
@@ -713,7 +735,7 @@ class Service:
                 if self._server is not None and self._server.is_serving():
                     log.info("robot %s has gone", hello.robot)
 
-    async def _hello(self, visitor: _Visitor, decode: Callable[[str | bytes], Any], kind: type[T]) -> T:
+    async def _hello(self, visitor: _Visitor, decode: Callable[[str | bytes], T]) -> T:
         """The first message, which says who it is; anything else is answered and waited past."""
         try:
             async with asyncio.timeout(HELLO_TIMEOUT):
@@ -721,17 +743,13 @@ class Service:
                     data = await visitor.receive()
                     visitor.dialect = Dialect(binary=isinstance(data, bytes))
                     try:
-                        message = decode(data)
-                        if isinstance(message, kind):
-                            return message
-                        raise MessageError('the first message must be {"type":"hello","robot":"<name>"}')
+                        return decode(data)
                     except MessageError as error:
                         await self._refuse(visitor, error)
         except TimeoutError:
             # It may not even read: no last word for it.
-            log.warning("%s has not said hello for %.0f s and was closed", visitor.name, HELLO_TIMEOUT)
             visitor.connection.transport.abort()
-            raise RefusedError("no hello") from None
+            raise RefusedError(f"it has not said hello for {HELLO_TIMEOUT:.0f} s") from None
 
     def _take(self, robot: Robot, visitor: _Visitor) -> _Link:
         """Make this the robot's connection. One that has been silent, as after a lost link, gives way."""

@@ -29,6 +29,18 @@ class Subscription:
     due: float = 0.0
     stalled_since: float | None = None
 
+    def is_due(self, now: float, early: bool = False) -> bool:
+        """Whether a message may go out. `early`: ahead of its time by up to one interval, to answer what just came;
+        the next one is then due as if it had been sent on time, so that the rate stays what it is."""
+        # A millisecond early is in time: a tick that is due at the same moment must not be missed by rounding.
+        return now >= self.due - (self.interval if early else 1e-3)
+
+    def sent(self, now: float) -> None:
+        """A message has gone out."""
+        # On schedule, so that 25 Hz out of 60 Hz is 25 Hz on average; but no catching up after a pause.
+        due = self.due + self.interval
+        self.due = due if due > now else now + self.interval
+
 
 @dataclass
 class Hub:
@@ -47,35 +59,42 @@ class Hub:
         topics: Collection[str] = (),
         rate_hz: float = 0.0,
         room: int = 0,
-    ) -> Iterator[None]:
+    ) -> Iterator[Subscription]:
         """`rate_hz` 0: every message. `room` 0: strictly the latest, nothing is added to what has not left yet."""
         interval = 1.0 / rate_hz if rate_hz > 0.0 else 0.0
         subscription = Subscription(write, waiting, abort, frozenset(topics), interval, room)
         self.subscriptions.append(subscription)
         try:
-            yield
+            yield subscription
         finally:
             self.subscriptions.remove(subscription)
 
     def wants(self, topic: str) -> bool:
         return any(topic in subscription.topics for subscription in self.subscriptions)
 
+    def due(self, now: float) -> set[str]:
+        """The topics of which somebody would get a message now."""
+        return set().union(*(client.topics for client in self.subscriptions if client.is_due(now)))
+
     def publish(self, now: float, messages: Mapping[str, bytes]) -> None:
         """`messages`: topic -> one encoded message. Those of one call count as one for the clients' rates."""
         for subscription in self.subscriptions:
-            wanted = subscription.topics & messages.keys()
-            # A millisecond early is in time: a tick that is due at the same moment must not be missed by rounding.
-            if not wanted or now < subscription.due - 1e-3:
-                continue
-            if subscription.waiting() > subscription.room:
-                self.dropped += len(wanted)
-                continue
-            # On schedule, so that 25 Hz out of 60 Hz is 25 Hz on average; but no catching up after a pause.
-            due = subscription.due + subscription.interval
-            subscription.due = due if due > now else now + subscription.interval
-            for topic in messages:
-                if topic in wanted:
-                    subscription.write(messages[topic])
+            if subscription.is_due(now):
+                wanted = subscription.topics & messages.keys()
+                if wanted:
+                    self._send(subscription, now, [messages[topic] for topic in messages if topic in wanted])
+
+    def answer(self, now: float, subscription: Subscription, message: bytes) -> None:
+        """Send one client a message that is due, perhaps early."""
+        self._send(subscription, now, [message])
+
+    def _send(self, subscription: Subscription, now: float, messages: Collection[bytes]) -> None:
+        if subscription.waiting() > subscription.room:
+            self.dropped += len(messages)
+            return
+        subscription.sent(now)
+        for message in messages:
+            subscription.write(message)
 
     def sweep(self, now: float) -> list[Subscription]:
         """Cut off the clients that have taken nothing for `STALL_LIMIT`, and return them. To be called regularly."""

@@ -112,7 +112,7 @@ class Robot:
                     self.dropped += len(rows) - i
                     return False
                 # The tuples' length is for the service to check: it answers a wrong one with an error in words.
-                await connection.send(encode(Imu(rows[i : i + BATCH])), text=True)  # type: ignore[arg-type]
+                await connection.send(encode(Imu(rows[i : i + BATCH])), text=True)
         except ConnectionClosed:
             self.dropped += len(rows) - i
             return False

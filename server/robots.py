@@ -14,11 +14,10 @@ from fusion.diagnosis import Diagnosis
 from fusion.health import Health
 from fusion.localiser import Localiser
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix
-from imu.clock import DeviceClock
-from imu.protocols import RawSample
+from imu.clock import DeviceClock, Reading
 from imu.mounting import BodyReadings
 from server.config import RobotConfig
-from server.messages import encode, pose_message
+from server.messages import Dialect, PoseMessage, pose_message
 
 # Seconds over which the rate of the IMU is counted.
 RATE_WINDOW = 2.0
@@ -61,9 +60,11 @@ class Robot:
     def connected(self) -> None:
         """Its IMU is there, perhaps with a clock that has begun anew."""
         self.clock = DeviceClock()
+        self.vitals.another_imu()
+        self._arrivals.clear()
         self.trouble = "it has connected, but sent no IMU data yet"
 
-    def feed_imu(self, raw: Sequence[RawSample], arrival: float, now: float) -> None:
+    def feed_imu(self, raw: Sequence[Reading], arrival: float, now: float) -> None:
         """Readings that reached the service together at `arrival`, and the filter now.
 
         The order in which inputs reach the filter is what a recording keeps as the order of their arrivals.
@@ -101,14 +102,16 @@ class Robot:
             self.published += 1
         return pose
 
-    def encode(self, pose: Pose, now: float) -> bytes:
+    def message(self, pose: Pose, now: float) -> PoseMessage:
         """For everyone."""
-        return encode(pose_message(pose, now, self.published))
+        return pose_message(pose, now, self.published)
 
-    def encode_own(self, pose: Pose, now: float) -> bytes:
-        """For the robot itself: with the time in its own clock, where that is known."""
+    def encode_own(self, pose: Pose, now: float, dialect: Dialect) -> bytes:
+        """For the robot itself: as it speaks, and with the time by its own clock, where that is known."""
         t_robot = self.clock.to_device(pose.t)
-        return encode(pose_message(pose, now, self.published, t_robot if math.isfinite(t_robot) else None))
+        return dialect.encode(
+            pose_message(pose, now, self.published, dialect.ticks(t_robot) if math.isfinite(t_robot) else None)
+        )
 
     def imu_rate_hz(self, now: float) -> float:
         recent = [(t, n) for t, n in self._arrivals if t >= now - RATE_WINDOW]

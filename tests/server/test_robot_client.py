@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusion.measurements import PoseFix, PoseHypothesis
+from fusion.measurements import Pose, PoseFix, PoseHypothesis
 from server.app import Service
 from server.config import Config, parse
 from server.messages import PoseMessage
@@ -112,13 +112,13 @@ def test_the_clock_is_exchanged() -> None:
 
 def test_without_poses_none_come() -> None:
     async def test() -> None:
+        published: list[Pose] = []
         async with (
-            Service(CONFIG) as service,
+            Service(CONFIG, published=published.append) as service,
             robot_of(service, pose_rate_hz=0) as robot,
             at_rest(service, robot),
         ):
-            await service.ready.wait()
-            while service.robots["rover"].published < 10:
+            while len(published) < 10:
                 await asyncio.sleep(0.01)
             assert robot.pose is None
             assert robot.pose_age == float("inf")
@@ -168,7 +168,9 @@ def test_what_the_service_cannot_use_is_said_and_survived(caplog: pytest.LogCapt
                 await poses(robot, 2)
             said = [record.message for record in caplog.records if record.name == "steadfix.robot"]
             assert len(said) == 3
-            assert "out of range" in said[0]
+            assert "sample 0, gz: found 4000.0; needed: rad/s" in said[0]
+            assert "sample 0: found a list of 6" in said[1]
+            assert "sample 0, az: found null" in said[2]
 
     run(test())
 
