@@ -93,32 +93,34 @@ def black(delivery: Delivery) -> str:
     return ""
 
 
-def advice(delivery: Delivery, *, focal_px: float, distance: float | None, asked_rate_hz: float = 0.0) -> list[str]:
-    """What is to be improved, a sentence each.
+def advice(
+    delivery: Delivery, *, focal_px: float, distance: float | None, asked_rate_hz: float = 0.0
+) -> dict[str, str]:
+    """What is to be improved, a sentence each, by what it is about: blur, light, rate, load.
 
     `focal_px`: the camera's focal length. `distance`: m from it to the robots, None while that is not known.
     `asked_rate_hz`: 0 where nothing was asked for.
     """
-    texts = []
+    texts = {}
     if distance is not None and delivery.exposure > 0.0:
         blur = blur_px(delivery.exposure, focal_px, distance)
         if blur > BLUR_LIMIT_PX:
-            texts.append(_shorter(blur, delivery))
+            texts["blur"] = _shorter(blur, delivery)
     if black(delivery):
         pass  # this is no matter of a little more light
     elif delivery.white < DARK:
-        texts.append(
+        texts["light"] = (
             f"the picture is dark (white is grey level {delivery.white:.0f} of 255): more light is best, else more gain"
         )
     elif delivery.saturated > GLARE:
-        texts.append(f"{delivery.saturated:.0%} of the picture is saturated: less gain or a shorter exposure")
+        texts["light"] = f"{delivery.saturated:.0%} of the picture is saturated: less gain or a shorter exposure"
     if asked_rate_hz and 0.0 < delivery.rate_hz < 0.8 * asked_rate_hz:
         why = "a compressed pixel_format may be needed to get them through USB"
         if delivery.exposure > 0.9 / asked_rate_hz:
             why = f"an exposure of {1e3 * delivery.exposure:g} ms leaves time for no more"
-        texts.append(f"{delivery.rate_hz:.0f} frames a second come where {asked_rate_hz:g} were asked for: {why}")
+        texts["rate"] = f"{delivery.rate_hz:.0f} frames a second come where {asked_rate_hz:g} were asked for: {why}"
     if delivery.used_hz < 0.5 * delivery.rate_hz:
-        texts.append(
+        texts["load"] = (
             f"{delivery.used_hz:.0f} of {delivery.rate_hz:.0f} frames a second are looked at, since this computer is "
             "too slow for more: a smaller picture makes it faster"
         )

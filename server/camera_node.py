@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import logging
 import math
+import os
 import socket
 import threading
 import time
@@ -19,7 +20,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import WebSocketException
+from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import DeliveryMeter, black
@@ -40,7 +41,7 @@ HELLO_TIMEOUT = 10.0
 READ_TIMEOUT = 5.0
 STATUS_EVERY = 1.0
 # Bytes that may wait in the kernel: what does not leave is to be replaced by what is newer.
-UNSENT = 16 * 1024
+UNSENT = 2 * 1024
 
 Open = Callable[[CameraWelcome], FrameSource]
 
@@ -175,14 +176,15 @@ class Node:
                     ping_timeout=PING_TIMEOUT,
                     proxy=None,
                 ) as connection:
-                    async with asyncio.timeout(HELLO_TIMEOUT):
-                        await self._begin(connection)
+                    await self._begin(connection)
                     welcomed = True
                     log.info("connected to %s as camera %s", self._url, self._name)
                     await self._talk(connection)
-                reason = "the service has ended the connection"
-            except (OSError, WebSocketException) as error:
-                reason = str(error) or type(error).__name__
+                reason = "the service has ended it"
+            except ConnectionClosed as error:
+                reason = (error.rcvd and error.rcvd.reason) or "it was lost"
+            except (OSError, WebSocketException, MessageError) as error:
+                reason = getattr(error, "strerror", None) or str(error) or "no answer"
             if self._ended.is_set():
                 break
             if welcomed:
@@ -203,10 +205,15 @@ class Node:
         if sock is not None and hasattr(socket, "TCP_NOTSENT_LOWAT"):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
         await connection.send(encode(CameraHello(self._name, self._token)), text=True)
-        welcome = to_node(await connection.recv())
+        try:
+            async with asyncio.timeout(HELLO_TIMEOUT):
+                welcome = to_node(await connection.recv())
+        except TimeoutError:
+            raise TimeoutError(f"no welcome within {HELLO_TIMEOUT:.0f} s") from None
         if isinstance(welcome, Error):
-            if self._watch is not None:
-                raise ConnectionRefusedError(f"refused: {welcome.reason}")  # it was welcome before
+            # A node that was welcome before, too: the service may be about to have its configuration put right.
+            if welcome.retry or self._watch is not None:
+                raise ConnectionRefusedError(f"refused: {welcome.reason}")
             raise NodeError(f"the service refuses camera {self._name}: {welcome.reason}")
         if not isinstance(welcome, CameraWelcome):
             raise MessageError("a first message that is no welcome")
@@ -271,9 +278,15 @@ class Node:
                 return
 
     async def _report(self, connection: ClientConnection) -> None:
+        """How the camera is, now and then; and on the log that nothing can be seen."""
+        assert self._watch is not None
+        said = ""
         while True:
-            assert self._watch is not None
             await connection.send(encode(self._status(self._watch.trouble)), text=True)
+            text = black(self._watch.meter.delivery(time.monotonic()))
+            if text and not said:
+                log.warning("%s", text)
+            said = text
             await asyncio.sleep(STATUS_EVERY)
 
     def _status(self, trouble: str) -> NodeStatus:
@@ -282,7 +295,6 @@ class Node:
         exposure, white, saturated = (
             value if math.isfinite(value) else None for value in (delivery.exposure, delivery.white, delivery.saturated)
         )
-        trouble = trouble or black(delivery)
         return NodeStatus(trouble, delivery.rate_hz, delivery.used_hz, exposure, white, saturated, self.dropped)
 
     async def _hear(self, connection: ClientConnection) -> None:
@@ -312,7 +324,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--server", required=True, metavar="URL", help="of the service, such as ws://192.168.1.10:5678")
     parser.add_argument("--name", required=True, help='of the camera: that [[camera]] has source = "remote" there')
-    parser.add_argument("--token", default="", help="of the camera, where the service asks for one")
+    parser.add_argument(
+        "--token",
+        default=os.environ.get("STEADFIX_TOKEN", ""),
+        help="of the camera, where the service asks for one; others on this machine see it, but not in STEADFIX_TOKEN",
+    )
 
 
 def run(args: argparse.Namespace) -> int:

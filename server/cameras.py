@@ -40,6 +40,8 @@ PLACEMENT_CHECK = 5.0
 MOVED_POSITION, MOVED_ROTATION = 0.005, math.radians(0.2)
 # s over which the frame rate is counted.
 RATE_WINDOW = 2.0
+# s for which a piece of advice must not have held until it is told again.
+GONE_AFTER = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +150,8 @@ class Camera:
             raise ConfigError(f'camera "{config.name}": {error}') from None
         self._image_size = (0, 0)
         self._meter = DeliveryMeter()
+        # What was told about the picture, and when it was last so.
+        self._told: dict[str, float] = {}
         # Anchors as seen in the frames of the present look; whether one whole look has been had; whether the last one
         # found the camera elsewhere.
         self._looks: list[list[MarkerSighting]] = []
@@ -325,11 +329,11 @@ class Camera:
         """What its source delivers, None where that is not known."""
         return self._meter.delivery(now)
 
-    def advice(self, now: float) -> list[str]:
-        """What would make its picture better, in words."""
+    def advice(self, now: float) -> dict[str, str]:
+        """What would make its picture better, in words, by what it is about."""
         delivery = self.delivery(now)
         if delivery is None:
-            return []
+            return {}
         return advice(
             delivery,
             focal_px=float(self.intrinsics.camera_matrix[0, 0]),
@@ -337,12 +341,24 @@ class Camera:
             asked_rate_hz=self.config.frame_rate_hz,
         )
 
+    def news(self, now: float) -> list[str]:
+        """What there is to say of its picture that has not been said yet, for the log."""
+        texts = self.advice(now)
+        if (delivery := self.delivery(now)) is not None and (text := black(delivery)):
+            texts["black"] = text
+        news = [text for about, text in texts.items() if about not in self._told]
+        # Said again when it has been away: one that is at its limit would otherwise come and go.
+        self._told = {about: now for about in texts} | {
+            about: t for about, t in self._told.items() if about not in texts and now - t < GONE_AFTER
+        }
+        return news
+
     def health(self, now: float) -> dict[str, Any]:
         placement = self.placement
         delivery = self.delivery(now)
         return {
             "status": self.status or (black(delivery) if delivery is not None else "") or "ok",
-            "advice": self.advice(now),
+            "advice": list(self.advice(now).values()),
             "frame_rate_hz": round(self.frame_rate_hz(now), 1),
             "frame_age": round(now - self.last_frame, 3) if math.isfinite(self.last_frame) else None,
             "frames": self.frames,

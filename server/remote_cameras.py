@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from websockets.asyncio.server import ServerConnection, broadcast
 
+from camera.calibration import CalibrationError
 from camera.exposure import Delivery
 from camera.markers import MarkerSighting
 from imu.clock import DeviceClock
@@ -141,6 +142,7 @@ class RemoteCamera(Camera):
                 asking.cancel()
             if self._connection is connection:
                 self._connection = None
+            if self._connection is None and not self._stop.is_set():
                 # A frame may have come after what the node said last.
                 self._say(f"its node ({node}) has gone; waiting for it{self._trouble and f' ({self._trouble})'}")
 
@@ -153,8 +155,11 @@ class RemoteCamera(Camera):
         for id in itertools.count():
             while len(questions) >= CLOCK_FAST_COUNT:
                 del questions[next(iter(questions))]
-            now = questions[id] = time.monotonic()
-            broadcast([connection], encode(ClockQuestion(id, now)), text=True)
+            now = time.monotonic()
+            # A question that waits behind others would measure those.
+            if connection.transport.get_write_buffer_size() == 0:
+                questions[id] = now
+                broadcast([connection], encode(ClockQuestion(id, now)), text=True)
             if now - self._heard >= SILENCE and self._connection is connection:
                 self._say(f"its node ({self.node}) says nothing any more; waiting for it")
             await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
@@ -188,6 +193,12 @@ class RemoteCamera(Camera):
             raise MessageError(f"markers that were not asked for: {sorted(unknown)}")
         if not seen.t <= seen.sent:
             raise MessageError(f"a frame of {seen.t - seen.sent:.3g} s after it was sent")
+        try:
+            self.intrinsics.check_size(seen.width_px, seen.height_px)
+        except CalibrationError as error:
+            # Said at both ends: either may be where it is put right.
+            self._say(str(error))
+            raise MessageError(str(error)) from None
         to_host, offset = self.clock.to_host, self.config.time_offset
         sightings = [
             MarkerSighting(

@@ -17,7 +17,7 @@ def with_(**changes):
 
 
 def told(delivery, distance=3.0, focal_px=1140.0, asked_rate_hz=0.0):
-    return advice(delivery, focal_px=focal_px, distance=distance, asked_rate_hz=asked_rate_hz)
+    return list(advice(delivery, focal_px=focal_px, distance=distance, asked_rate_hz=asked_rate_hz).values())
 
 
 def test_the_blur_is_how_far_a_marker_moves_in_a_rendered_picture():
