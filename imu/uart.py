@@ -19,6 +19,9 @@ class SerialImu:
     `received(data, arrival)` is called in the reader thread for all bytes that came together, with the host monotonic
     time at which they were read. `lost(error)` is called there once, with an OSError that names the port, if the device
     goes away; not after `close`. Raises OSError in plain words if the port cannot be opened, or not at this speed.
+
+    `low_latency`: whether the driver was told to hand bytes on at once; where it cannot be told, `imu.health` notices
+    batches and says how to set its latency timer.
     """
 
     def __init__(
@@ -37,9 +40,11 @@ class SerialImu:
             raise OSError(f"serial port {port}: it does not do {baud} baud") from None
         except serial.SerialException as error:
             raise OSError(f"serial port {port}: {_plain(error)}") from None
+        self.low_latency = False
         # Drivers that cannot do it (a pty, most USB modems) say so in different ways.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             self._serial.set_low_latency_mode(True)
+            self.low_latency = True
         self._closing = threading.Event()
         self._message: bytes | None = None
         self._message_ready = threading.Condition()
@@ -49,6 +54,12 @@ class SerialImu:
         ]
         for thread in self._threads:
             thread.start()
+
+    def set_baud(self, baud: int) -> None:
+        """Go on at another speed, if the port has it; what has come at the old one is dropped."""
+        with contextlib.suppress(OSError, ValueError):
+            self._serial.baudrate = baud
+            self._serial.reset_input_buffer()
 
     def write(self, data: bytes) -> None:
         """Send `data` as soon as the line is free. Does not block; what still waits is replaced: the latest wins."""

@@ -19,12 +19,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 COMMANDS = {
     "run": ("server.run", "the service: cameras and IMUs in, poses out; without a configuration a simulated room"),
     "camera": ("server.camera_node", "the node of a remote camera: captures here, for a service elsewhere"),
+    "imu": ("server.imu", "what an IMU sends, live, and what is wrong with it"),
     "imu-rest": ("server.imu_rest", "an IMU's bias, scatter and mounting, from ten seconds at rest"),
     "imu-positions": ("server.imu_positions", "an accelerometer's bias and scale, from its six sides"),
+    "allan": ("server.allan", "an IMU's noise, from hours at rest"),
     "replay": ("server.replay", "run a recording through the filter again"),
     "markers": ("server.markers", "a sheet of markers to print"),
     "board": ("server.board", "a calibration board to print"),
     "calibrate": ("server.calibrate", "a camera's focal length and distortion, from pictures of a board"),
+    "floor": ("server.floor", "where the cameras hang, from anchors on the floor"),
     "detect": ("server.detect", "find markers in images"),
 }
 # Exit status: 1 for what the machine refused, 2 for what the user can put right, as argparse has it.
