@@ -18,7 +18,7 @@ from typing import Any, get_args
 import numpy as np
 
 from imu.clock import DeviceClock
-from imu.health import Finding, StreamHealth
+from imu.health import WINDOW, Finding, StreamHealth
 from imu.protocols import RawSample
 from imu.protocols.detection import Detector, ProtocolName, open_parser
 from imu.uart import SerialImu
@@ -111,18 +111,26 @@ class _Watch:
         """Bytes that came together; `arrival` is NaN for those of a file."""
         self.bytes += len(data)
         self.heard = time.monotonic()
-        samples = self.parser.feed(data)
+        self._take(self.parser.feed(data), arrival)
         if self.port is not None and isinstance(self.parser, Detector) and self.parser.baud != self.baud:
             self.baud = self.parser.baud
             self.port.set_baud(self.baud)
-        for at in range(0, len(samples), LOOK_EVERY):
-            self._take(samples[at : at + LOOK_EVERY], arrival)
+
+    def end(self) -> None:
+        """No more comes: what is left in the parser."""
+        # A last line without an end.
+        if self.bytes and self.parser.protocol in ("", "json", "csv", "vectornav"):
+            self._take(self.parser.feed(b"\n"), math.nan)
+        if isinstance(self.parser, Detector):
+            self._take(self.parser.settle(), math.nan)
 
     def _take(self, samples: Sequence[RawSample], arrival: float) -> None:
-        if math.isnan(arrival):
-            readings = np.array(samples, dtype=np.float64)
-        else:
-            readings = self.clock.stamp(samples, arrival)
+        for at in range(0, len(samples), LOOK_EVERY):
+            self._look(samples[at : at + LOOK_EVERY], arrival)
+
+    def _look(self, samples: Sequence[RawSample], arrival: float) -> None:
+        of_file = math.isnan(arrival)
+        readings = np.array(samples, dtype=np.float64) if of_file else self.clock.stamp(samples, arrival)
         before = self.health.samples
         self.health.feed(samples, readings, arrival)
         self.latest = samples[-1]
@@ -139,6 +147,8 @@ class _Watch:
             found.insert(0, Finding("imu_silent", "error", text, {"seconds": silence}))
         elif self.health.samples == 0 and not found:
             text = f"{self.bytes} bytes, and no sample yet" if self.bytes else "nothing has come yet"
+            if self.parser.frames:
+                text = f"{self.parser.protocol}: {self.parser.frames} messages, none with a sample of an IMU yet"
             found.append(Finding("imu_silent", "note" if self.is_port else "error", text, {"bytes": self.bytes}))
         self._said.update((finding.code, finding) for finding in found if finding.code != "imu_silent")
         return found
@@ -213,9 +223,7 @@ def _file(watch: _Watch, source: str) -> Iterator[float]:
         while data := os.read(fd, CHUNK):
             watch.feed(data, math.nan)
             yield time.monotonic()
-    # A last line without an end.
-    if watch.parser.protocol in ("json", "csv", "vectornav"):
-        watch.feed(b"\n", math.nan)
+    watch.end()
 
 
 class _View:
@@ -249,11 +257,10 @@ def _text(report: dict[str, Any]) -> str:
     baud = f", {report['baud']} baud" if report["baud"] else ""
     lines = [f"{report['source']}: {report['protocol'] or 'protocol not recognised yet'}{baud}"]
     rate = "rate unknown" if report["rate_hz"] is None else f"{report['rate_hz']:.1f} Hz"
-    gaps = f"{report['gaps']} gaps"
-    if report["longest_gap_ms"]:
-        gaps += f" of up to {report['longest_gap_ms']:.0f} ms"
     lost = f"{report['missing']} missing, {report['dropped']} dropped ({report['dropped_bytes']} bytes)"
-    lines.append(f"  samples  {report['samples']}, {rate}, {gaps}, {lost}")
+    longest = f" of up to {report['longest_gap_ms']:.0f} ms" if report["longest_gap_ms"] else ""
+    lines.append(f"  samples  {report['samples']}, {rate}, {lost}")
+    lines.append(f"  gaps     {report['gaps']}{longest} in the last {WINDOW:.0f} s")
     if clock := report["clock"]:
         lines.append(
             f"  clock    offset {clock['offset_s']:+.6f} s, skew {clock['skew_ppm']:+.0f} ppm, "
@@ -277,8 +284,7 @@ def _text(report: dict[str, Any]) -> str:
         lines.append(f"           accel scatter {noise} m/s2")
     elif report["samples"]:
         lines.append("  rest     it moves, or too little is known")
-    for finding in report["findings"]:
-        lines.append(f"  {finding['severity']}: {finding['text']}")
+    lines += [f"  {finding['severity']}: {finding['text']}" for finding in report["findings"]]
     if not report["findings"]:
         lines.append("  nothing is wrong")
     return "\n".join(lines)

@@ -33,15 +33,17 @@ class DroppedError(ValueError):
 class Parser:
     """Bytes of one protocol to samples. A subclass says how, in `feed`.
 
-    `reasons` says how many lines or frames were dropped for which reason, and `last_error` the latest in words.
-    `dropped_bytes`: bytes that belong to no line or frame that could be used. `missing`: frames that the device
-    numbered and that never came. `note`: what this protocol cannot give, "" for nothing.
+    `frames`: lines or frames that were understood, with a sample in them or without. `reasons` says how many were
+    dropped for which reason, and `last_error` the latest in words. `dropped_bytes`: bytes that belong to no line or
+    frame that could be used. `missing`: frames that the device numbered and that never came. `note`: what this protocol
+    cannot give, "" for nothing.
     """
 
     protocol = ""
     note = ""
 
     def __init__(self) -> None:
+        self.frames = 0
         self.reasons: Counter[str] = Counter()
         self.last_error = ""
         self.dropped_bytes = 0

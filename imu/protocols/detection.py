@@ -73,21 +73,45 @@ class Detector(Parser):
 
     def feed(self, data: bytes) -> list[RawSample]:
         samples = self._try(data) if self._chosen is None else self._chosen.feed(data)
-        if self._chosen is not None:
-            self.last_error, self.missing = self._chosen.last_error, self._chosen.missing
-            self.dropped_bytes = self._chosen.dropped_bytes
+        self._report()
         return samples
+
+    def settle(self) -> list[RawSample]:
+        """No more will come: the samples of the parser that has understood most, too few to be sure of it till now."""
+        if self._chosen is None:
+            parser, samples = self._best()
+            if parser.frames:
+                self._choose(parser)
+                return samples
+            if self._heard.strip():
+                self._drop(DroppedError("not recognised", describe(self._heard)))
+        return []
+
+    def _best(self) -> tuple[Parser, list[RawSample]]:
+        return max(self._candidates, key=lambda candidate: (len(candidate[1]), candidate[0].frames))
+
+    def _choose(self, parser: Parser) -> None:
+        self._chosen = parser
+        self.protocol, self.note, self.reasons = parser.protocol, parser.note, parser.reasons
+        self._report()
+
+    def _report(self) -> None:
+        if self._chosen is not None:
+            self.frames, self.last_error = self._chosen.frames, self._chosen.last_error
+            self.dropped_bytes, self.missing = self._chosen.dropped_bytes, self._chosen.missing
 
     def _try(self, data: bytes) -> list[RawSample]:
         for parser, samples in self._candidates:
             samples += parser.feed(data)
             if len(samples) >= ENOUGH:
-                self._chosen = parser
-                self.protocol, self.note, self.reasons = parser.protocol, parser.note, parser.reasons
+                self._choose(parser)
                 return samples
         self._heard += data[:PUZZLED]
         self.dropped_bytes += len(data)
-        if len(self._heard) >= PUZZLED:
+        if len(self._heard) >= PUZZLED and self._best()[0].frames >= ENOUGH:
+            # A known protocol, with other messages than those wanted.
+            self._choose(self._best()[0])
+        elif len(self._heard) >= PUZZLED:
             self._drop(
                 DroppedError("not recognised", describe(self._heard) + (f" (at {self.baud} baud)" if self.baud else ""))
             )

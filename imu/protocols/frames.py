@@ -53,6 +53,7 @@ class FrameParser(Parser):
                 continue
             self._skip(begin - at)
             self._room = self._run = 0
+            self.frames += 1
             at = begin + length
             try:
                 if (sample := self._decode(data[begin:at])) is not None:

@@ -34,8 +34,11 @@ class LineParser(Parser):
                     self.dropped_bytes += len(line) + 1
                 elif len(line) > MAX_LINE:
                     raise DroppedError("too long", f"more than {MAX_LINE} bytes without an end of line")
-                elif line and not line.isspace() and (sample := self._decode(line)) is not None:
-                    samples.append(sample)
+                elif line and not line.isspace():
+                    sample = self._decode(line)
+                    self.frames += 1
+                    if sample is not None:
+                        samples.append(sample)
             except DroppedError as error:
                 self._drop(error)
                 self.dropped_bytes += len(line) + 1
