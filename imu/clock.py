@@ -175,7 +175,8 @@ class DeviceClock:
         a jump of the device's clock, the second holds). Samples without a device time are spread evenly over the time
         since the last arrival: all that is known of them.
         """
-        for device_time, *_ in samples:
+        times = [sample[0] for sample in samples]
+        for device_time in times[-1:] if self._is_usual(times, arrival) else times:
             self.has_stamps = device_time is not None
             if device_time is not None:
                 self.observe(device_time, arrival)
@@ -183,13 +184,31 @@ class DeviceClock:
         spacing = (arrival - self._last_arrival) / max(1, n)
         if not spacing < UNSTAMPED_PAUSE:
             spacing = UNSTAMPED_SPACING
-        stamped = np.empty((n, 7))
-        for i, (device_time, *readings) in enumerate(samples):
-            t = arrival - (n - 1 - i) * spacing if device_time is None else self.to_host(device_time)
+        delay = self.minimum_delay or 0.0
+        stamped = np.array(samples, dtype=np.float64).reshape(n, 7)
+        for i, device_time in enumerate(times):
+            if device_time is None:
+                t = arrival - (n - 1 - i) * spacing
+            else:
+                t = self._line(self._unwrap(device_time, self._newest)) - delay
             self._last_stamp = min(max(t, self._last_stamp + MONOTONE_STEP), arrival)
-            stamped[i] = self._last_stamp, *readings
+            stamped[i, 0] = self._last_stamp
         self._last_arrival = arrival
         return stamped
+
+    def _is_usual(self, times: Sequence[float | None], arrival: float) -> bool:
+        """Whether samples that arrived together follow the last ones, oldest first, without a jump or a wrap.
+
+        Then the newest alone can move the line, since it has the least delay of them.
+        """
+        if not times or self._suspect or self._wrap != math.inf:
+            return False
+        before = self._newest - JUMP
+        for device_time in times:
+            if device_time is None or device_time < before:
+                return False
+            before = device_time
+        return self._origin is not None and arrival - self._line(before) >= -JUMP
 
     def _line(self, device_time: float) -> float:
         """The line under the arrivals, host s."""

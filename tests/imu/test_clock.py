@@ -208,3 +208,20 @@ def test_samples_without_stamps_fill_the_time_since_the_last_arrival() -> None:
     assert clock.has_stamps is False
     stamp(clock, [7.0], 10.03)
     assert clock.has_stamps is True
+
+
+def test_a_batch_moves_the_line_as_if_each_of_its_samples_had_been_observed() -> None:
+    """Of a usual batch only the newest is."""
+    rng = np.random.default_rng(6)
+    together, each = DeviceClock(), DeviceClock()
+    for i in range(400):
+        times: list[float | None] = [50.0 + 0.05 * i + 0.005 * k + (1e4 if i > 300 else 0.0) for k in range(10)]
+        if i % 37 == 36:
+            times[4] = 1.0
+        arrival = 1000.1 + 0.05 * i + float(rng.exponential(3e-3))
+        for t in times:
+            each.observe(float(t or 0.0), arrival)
+        stamp(together, times, arrival)
+        assert together.to_host(60.0) == each.to_host(60.0)
+        assert together.restarts == each.restarts
+    assert each.restarts == 1
