@@ -164,8 +164,10 @@ def _check_consistent(
     worst = {id: _worst_shift(id, seen, intrinsics, world_from_camera) for id in ids}
     if len(ids) < 2 or max(worst.values()) <= CONTRADICTION / 2.0:
         return
-    # The least squares spread one anchor's error over all: leave each out and see whether the others then agree.
-    agreeing: dict[int, float] = {}
+    # The least squares spread one anchor's error over all: leave each out and see whether the others then agree. This
+    # may be so for several, since a camera that is elsewhere explains much; wrong is the one without which the corners
+    # fit best.
+    agreeing: dict[int, tuple[float, float]] = {}
     if len(ids) > 2:
         for left_out in ids:
             rest = [pair for pair in seen if pair[0].id != left_out]
@@ -173,13 +175,14 @@ def _check_consistent(
             if found is None:
                 continue
             if all(_worst_shift(id, rest, intrinsics, found[0]) <= CONTRADICTION / 2.0 for id in ids if id != left_out):
-                agreeing[left_out] = _worst_shift(left_out, seen, intrinsics, found[0])
+                agreeing[left_out] = found[2], _worst_shift(left_out, seen, intrinsics, found[0])
     if agreeing:
-        id = max(agreeing, key=lambda key: agreeing[key])
-        if agreeing[id] > CONTRADICTION:
+        id = min(agreeing, key=lambda key: agreeing[key])
+        shift = agreeing[id][1]
+        if shift > CONTRADICTION:
             others = [other for other in ids if other != id]
             raise PlacementError(
-                f"anchor {id} is {agreeing[id]:.2f} m away from where {_listed(others)} put it, which agree with each "
+                f"anchor {id} is {shift:.2f} m away from where {_listed(others)} put it, which agree with each "
                 "other: check its id, size_mm, position_m and yaw_deg"
             )
         return

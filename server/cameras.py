@@ -7,8 +7,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,7 +18,7 @@ from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import Delivery, DeliveryMeter, advice, black
 from camera.fix import Body, MarkerMount, marker_poses, predict, rays, solve
-from camera.floor import Anchor, Placement, PlacementError, load_placement, locate_camera
+from camera.floor import Anchor, Placement, PlacementError, averaged, load_placement, locate_camera
 from camera.markers import MarkerSighting
 from camera.shake import measure_shake, shaken
 from camera.tracking import MarkerTracker
@@ -123,9 +123,9 @@ class Camera:
         self._poses_at = poses_at
         if not Path(config.calibration).is_file():
             raise CalibrationError(
-                f'camera "{config.name}": there is no calibration file {config.calibration}. It holds the camera '
-                "matrix and distortion of this very camera at this image size, as OpenCV's calibrateCamera gives "
-                "them; example-camera.toml, beside example.toml, shows the format and will do for a first try"
+                f'camera "{config.name}": there is no calibration file {config.calibration}. It holds the '
+                "focal length and distortion of this very camera at this image size, and `steadfix calibrate` makes it; "
+                "example-camera.toml, beside example.toml, will do for a first try"
             )
         self.intrinsics = load_intrinsics(config.calibration)
         if config.placement:
@@ -135,7 +135,7 @@ class Camera:
                     "it, or leave the key out and the camera is located from the anchors in view"
                 )
             self.placement, self.unlocated = load_placement(config.placement), ""
-        self._anchors = [_anchor(anchor) for anchor in room.anchor]
+        self._anchors = [configured_anchor(anchor) for anchor in room.anchor]
         self.anchor_ids = {anchor.id for anchor in room.anchor}
         self._bodies = [
             Body(robot.name, [_mount(marker) for marker in robot.marker], planar=robot.motion != "free")
@@ -274,15 +274,15 @@ class Camera:
             self._looks.clear()
             self._next_look = now + PLACEMENT_CHECK
         try:
-            averaged = _averaged(looks)
-            found = locate_camera(averaged, self._anchors, self.intrinsics)
+            sightings = averaged(looks)
+            found = locate_camera(sightings, self._anchors, self.intrinsics)
         except PlacementError as error:
             if str(error) != self.unlocated:
                 log.warning("camera %s: %s", self.config.name, error)
             self.unlocated = str(error)
             return
         self.unlocated = ""
-        at_rest = {sighting.id: sighting.corners_px for sighting in averaged}
+        at_rest = {sighting.id: sighting.corners_px for sighting in sightings}
         if not self._settled:
             if self.placement is None:
                 height = float(found.world_from_camera[2, 3])
@@ -371,7 +371,7 @@ class Camera:
         }
 
 
-def _anchor(config: AnchorConfig) -> Anchor:
+def configured_anchor(config: AnchorConfig) -> Anchor:
     return Anchor(config.id, config.size_mm / 1000.0, _pose(config.position_m, config.yaw_deg))
 
 
@@ -381,21 +381,6 @@ def _mount(config: MarkerConfig) -> MarkerMount:
 
 def _pose(position_m: tuple[float, float, float], yaw_deg: float) -> Array:
     return transform(rotation_about_z(math.radians(yaw_deg)), position_m)
-
-
-def _averaged(looks: Sequence[Sequence[MarkerSighting]]) -> list[MarkerSighting]:
-    """One sighting for each marker, its corners the mean over the looks: the camera stands still, its noise does not.
-
-    The sigma stays that of one look, since what is left is mostly bias.
-    """
-    by_id: dict[int, list[MarkerSighting]] = {}
-    for look in looks:
-        for sighting in look:
-            by_id.setdefault(sighting.id, []).append(sighting)
-    return [
-        replace(same[-1], corners_px=np.mean([sighting.corners_px for sighting in same], axis=0))
-        for same in by_id.values()
-    ]
 
 
 def _moved(kept: Placement, found: Placement) -> float | None:

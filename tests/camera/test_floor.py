@@ -202,7 +202,7 @@ def test_two_cameras_share_a_world_through_an_anchor_that_both_see():
         place = found.placements[name]
         assert nees(pose, place.world_from_camera[:3, 3], rotation, place.covariance) < chi_square_limit(6)
     apart = [s for s in sightings if not (s.camera == "east" and s.id == 41)]
-    with pytest.raises(PlacementError, match="camera (west|east) sees no anchor that another camera sees"):
+    with pytest.raises(PlacementError, match=r"camera (west|east) sees no anchor that another camera sees"):
         survey(apart, believed, both, measured)
 
 
@@ -229,6 +229,19 @@ def test_an_anchor_that_is_centimetres_off_is_doubted_by_name():
     believed[2] = replace(believed[2], world_from_marker=away)
     (doubt,) = survey(sightings, believed, {"ceiling": INTRINSICS}).doubts
     assert re.match(r"anchor 42 is [34]\d mm from where anchors 40, 41, 43 put it", doubt)
+
+
+@pytest.mark.parametrize("wrong", range(4))
+@pytest.mark.parametrize("size", [0.1, 0.4])
+def test_the_right_one_of_four_is_blamed_wherever_it_is_believed(wrong, size):
+    random = np.random.default_rng(30 + wrong)
+    for way in np.arange(4) * np.pi / 2.0 + 0.3:
+        sightings, believed, _, _ = room(random)
+        away = transform(np.eye(3), [size * np.cos(way), size * np.sin(way), 0.0])
+        place = away @ believed[wrong].world_from_marker
+        believed[wrong] = replace(believed[wrong], world_from_marker=place)
+        with pytest.raises(PlacementError, match=rf"anchor {40 + wrong} is "):
+            survey(sightings, believed, {"ceiling": INTRINSICS})
 
 
 def test_a_print_of_another_size_is_told_from_tapes_that_are_right():
