@@ -93,7 +93,8 @@ async def _serve_until(
         address = f"{_reachable(config.server.host)}:{service.port}"
         if room is not None:
             room.start(f"ws://{address}")
-        print(f"{SERVICE}: http://{address}/", flush=True)
+        scheme = "https" if config.server.certificate else "http"
+        print(f"{SERVICE}: {scheme}://{address}/", flush=True)
         stopped = asyncio.create_task(stop.wait())
         await asyncio.wait((stopped, service.failed), return_when=asyncio.FIRST_COMPLETED)
         stopped.cancel()
