@@ -22,8 +22,10 @@ WINDOW = 1.0
 # the quietest window is quieter, a window at rest is within CALMER times that.
 SCATTER = (0.008, 0.15)
 CALMER = 4.0
-# rad/s and m/s2: by how much the means of two windows of one rest may differ.
+# rad/s and m/s2: by how much the mean of a window may differ from that of the RECENT ones before it. From all of them
+# it may by more: within hours a bias drifts with the temperature.
 CHANGE = (0.005, 0.15)
+RECENT = 10
 # rad/s: a larger mean rate is no gyroscope's bias.
 LARGEST_BIAS = 0.3
 # Gravity is read within this share by an accelerometer that needs no repair.
@@ -89,7 +91,7 @@ def rests(readings: Array) -> list[slice]:
     for i in range(n + 1):
         moved = i == n or not quiet[i]
         if not moved and i > first:
-            change = np.abs(window[i] - window[first:i].mean(axis=0))
+            change = np.abs(window[i] - window[max(first, i - RECENT) : i].mean(axis=0))
             moved = bool(change[:3].max() > CHANGE[0] or change[3:].max() > CHANGE[1])
         if moved:
             if i > first:

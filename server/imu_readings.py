@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+from tqdm import tqdm
 
 from fusion.measurements import Array
 from imu.calibration import CalibrationError
@@ -24,13 +25,17 @@ SILENCE = 5.0
 CHUNK = 1 << 20
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
-    """The arguments that say where from."""
-    parser.add_argument("source", metavar="SOURCE", help="serial port, file of what one sent, or recording folder")
+def add_source(parser: argparse.ArgumentParser, *, port: bool = True) -> None:
+    """The arguments that say where from. `port`: whether that may be a serial one."""
+    kinds = (
+        "serial port, file of what one sent, or recording folder" if port else "file of what a port sent, or recording"
+    )
+    parser.add_argument("source", metavar="SOURCE" if port else "FILE", help=kinds)
     parser.add_argument("--protocol", choices=get_args(ProtocolName), default="auto", help="default: as it looks")
     parser.add_argument("--columns", default="", metavar="C", help="of CSV, such as t[us],gx[deg/s],...,az[g]")
-    parser.add_argument("--baud", type=int, default=115200, help="of a serial port; default 115200")
     parser.add_argument("--rate-hz", type=_rate, metavar="HZ", help="of a file whose samples bear no time")
+    if port:
+        parser.add_argument("--baud", type=int, default=115200, help="of a serial port; default 115200")
 
 
 def readings(args: argparse.Namespace, notice: str) -> Iterator[Array]:
@@ -40,14 +45,10 @@ def readings(args: argparse.Namespace, notice: str) -> Iterator[Array]:
     it is lost or silent. Raises CalibrationError for a file that holds nothing usable.
     """
     path = Path(args.source)
-    if path.is_dir():
-        path /= "imu.csv"
-    if path.is_file():
-        yield _of_file(path, args)
-    elif path.suffix and not path.exists():
-        raise CalibrationError(f"{path}: no such file")
+    if path.is_file() or path.is_dir() or (path.suffix and not path.exists()):
+        yield file_readings(args)
     else:
-        yield from _of_port(args, notice)
+        yield from _port_readings(args, notice)
 
 
 def _rate(text: str) -> float:
@@ -57,12 +58,22 @@ def _rate(text: str) -> float:
     return rate
 
 
-def _of_file(path: Path, args: argparse.Namespace) -> Array:
+def file_readings(args: argparse.Namespace) -> Array:
+    """(n, 7) of the file, or of the recording, that `add_source` named. Raises CalibrationError, and OSError."""
+    path = Path(args.source)
+    if path.is_dir():
+        path /= "imu.csv"
+    if not path.is_file():
+        raise CalibrationError(f"{path}: {'this is no file' if path.exists() else 'no such file'}")
     parser = open_parser(args.protocol, args.columns)
     parts = []
-    with path.open("rb") as file:
+    with (
+        path.open("rb") as file,
+        tqdm(total=path.stat().st_size, unit="B", unit_scale=True, delay=1.0, leave=False, disable=None) as bar,
+    ):
         while data := file.read(CHUNK):
             parts.append(np.array(parser.feed(data), dtype=np.float64).reshape(-1, 7))
+            bar.update(len(data))
     # a last line without an end
     parts.append(np.array(parser.feed(b"\n"), dtype=np.float64).reshape(-1, 7))
     samples = np.concatenate(parts)
@@ -75,7 +86,7 @@ def _of_file(path: Path, args: argparse.Namespace) -> Array:
     return samples
 
 
-def _of_port(args: argparse.Namespace, notice: str) -> Iterator[Array]:
+def _port_readings(args: argparse.Namespace, notice: str) -> Iterator[Array]:
     parser = open_parser(args.protocol, args.columns, args.baud)
     clock = DeviceClock()
     arrived: queue.SimpleQueue[tuple[bytes, float] | OSError] = queue.SimpleQueue()

@@ -24,6 +24,7 @@ DOORS = {
     "pymavlink": {"imu/protocols/mavlink.py"},
     "websockets": {"server/app.py", "server/robot_client.py", "server/remote_cameras.py", "server/camera_node.py"},
     "filterpy": {"fusion/reference.py"},
+    "allantools": {"imu/allan.py"},
     "numba": {"fusion/kernels.py"},
 }
 # `fusion` is pure: time and data are arguments, and it returns instead of saying anything.
@@ -66,7 +67,7 @@ def test_no_module_bears_the_name_of_a_library(path: Path) -> None:
 def test_the_doors_are_used() -> None:
     """A door nobody goes through has been walled up and forgotten here."""
     through = {(top, name(path)) for path in MODULES for top in {found.partition(".")[0] for found in imports(path)}}
-    for library in ("serial", "pymavlink", "websockets", "filterpy", "numba", "picamera2"):
+    for library in ("serial", "pymavlink", "websockets", "filterpy", "numba", "picamera2", "allantools"):
         for door in DOORS[library]:
             if (ROOT / door).exists():
                 assert (library, door) in through
