@@ -25,7 +25,6 @@ from fusion.geometry import (
     inverse,
     quaternion_from_rotation,
     rotation_from_quaternion,
-    skew,
     transform,
     transform_points,
 )
@@ -37,6 +36,7 @@ FLOOR_HEIGHT_SIGMA = 0.005
 FLOOR_TILT_SIGMA = 0.01
 
 _PLANAR = [0, 1, 5]
+_PLANAR_ROWS = [[0], [1], [5]]
 _ASSUMED = [2, 3, 4]
 _ASSUMED_COVARIANCE = np.diag([FLOOR_HEIGHT_SIGMA**2, FLOOR_TILT_SIGMA**2, FLOOR_TILT_SIGMA**2])
 
@@ -148,10 +148,9 @@ class View:
         expected, by_point = project(points_camera, self.intrinsics)
         by_position = by_point @ self.world_from_camera[:3, :3].T
         lever = points_world - world_from_body[:3, 3]
-        by_rotation = _by_rotation(by_position, lever)
         weight = 1.0 / self.sigma_px
         residual = (self.corners_px - expected) * weight[:, None]
-        jacobian = np.concatenate([by_position, by_rotation], axis=2) * weight[:, None, None]
+        jacobian = _by_pose(by_position, lever) * weight[:, None, None]
         return residual.ravel(), jacobian.reshape(-1, 6)
 
     def refine(self, world_from_body: Array, columns: Sequence[int] = range(6)) -> tuple[Array, Array, float] | None:
@@ -297,7 +296,7 @@ def predict(
     pixels, by_point = project(np.where(visible[:, None, None], in_camera, [0.0, 0.0, 1.0]).reshape(-1, 3), intrinsics)
     corners = pixels.reshape(-1, 4, 2)
     by_position = (by_point @ world_from_camera[:3, :3].T).reshape(-1, 4, 2, 3)
-    by_pose = np.concatenate([by_position, _by_rotation(by_position, lever)], axis=-1)
+    by_pose = _by_pose(by_position, lever)
     if line_time:
         motion = np.array([[*pose.velocity, *(R[k] @ pose.angular_velocity)] for k, (pose, _, _) in enumerate(known)])
         rows = corners[..., 1].mean(axis=1)
@@ -349,8 +348,7 @@ def _planar(
         in_camera = (lever - camera) @ R + state[of, :2] @ R[:2]
         possible &= np.minimum.reduceat(in_camera[:, 2], first) > 1e-3
         expected, by_point = project(np.where(possible[of, None], in_camera, [0.0, 0.0, 1.0]), intrinsics)
-        by_position = by_point @ R.T
-        J = np.concatenate([by_position, _by_rotation(by_position, lever)], axis=2) / sigma_px[:, None, None]
+        J = _by_pose(by_point @ R.T, lever) / sigma_px[:, None, None]
         residual = (corners - expected) / sigma_px[:, None]
         normal = np.add.reduceat(J.transpose(0, 2, 1) @ J, first)
         gradient = np.add.reduceat((residual[:, None] @ J)[:, 0], first)[:, _PLANAR]
@@ -366,17 +364,17 @@ def _planar(
     assumed = np.zeros((len(seen), 6, 3))
     assumed[:, _PLANAR] = gain[:, :, _ASSUMED]
     assumed[:, _ASSUMED] = -np.eye(3)
+    moved = gain @ _body_by_placement(np.column_stack([state[:, :2], np.zeros(len(seen))]), camera)
+    inflation = [_inflation(m, 2 * n - 3) for m, n in zip(misfit.tolist(), count.tolist(), strict=True)]
     covariance = assumed @ _ASSUMED_COVARIANCE @ assumed.transpose(0, 2, 1)
+    covariance[:, _PLANAR_ROWS, _PLANAR] += noise * np.array(inflation)[:, None, None]
+    covariance[:, _PLANAR_ROWS, _PLANAR] += moved @ placement @ moved.transpose(0, 2, 1)
     hypotheses: dict[str, list[PoseHypothesis]] = {}
     for k, (body, _) in enumerate(seen):
-        if not possible[k] or not np.isfinite(state[k]).all():
-            continue
         x, y, yaw = state[k].tolist()
-        moved = gain[k] @ _body_by_placement(np.array([x, y, 0.0]), camera)
-        inflation = _inflation(float(misfit[k]), 2 * int(count[k]) - 3)
-        covariance[k][np.ix_(_PLANAR, _PLANAR)] += noise[k] * inflation + moved @ placement @ moved.T
-        quaternion = np.array([math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
-        hypotheses[body.name] = [PoseHypothesis(np.array([x, y, 0.0]), quaternion, covariance[k], float(misfit[k]))]
+        if possible[k] and math.isfinite(x + y + yaw):
+            quaternion = np.array([math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
+            hypotheses[body.name] = [PoseHypothesis(np.array([x, y, 0.0]), quaternion, covariance[k], float(misfit[k]))]
     return hypotheses
 
 
@@ -423,14 +421,18 @@ def _turned(points: Array, yaw: Array) -> Array:
     return np.column_stack([c * x - s * y, s * x + c * y, z])
 
 
-def _by_rotation(by_position: Array, lever: Array) -> Array:
-    """(..., 2, 3): how pixels answer to a rotation of a body, from how they do to a shift of a point of it (..., 2, 3).
+def _by_pose(by_position: Array, lever: Array) -> Array:
+    """(..., 2, 6): how pixels answer to a body's position and rotation, from how they do to a shift of a point of it
+    (..., 2, 3) that is `lever` (..., 3) away from the body's origin.
 
-    `lever` (..., 3): from the body's origin to the point. d(p + exp(dtheta) x) / d dtheta = -[x]x, and -j [x]x = x × j.
+    d(p + exp(dtheta) x) / d dtheta = -[x]x, and -j [x]x = x × j.
     """
-    x, y, z = np.moveaxis(lever[..., None, :], -1, 0)
-    a, b, c = np.moveaxis(by_position, -1, 0)
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
+    x, y, z = lever[..., 0, None], lever[..., 1, None], lever[..., 2, None]
+    a, b, c = by_position[..., 0], by_position[..., 1], by_position[..., 2]
+    both = np.empty((*by_position.shape[:-1], 6))
+    both[..., :3] = by_position
+    both[..., 3], both[..., 4], both[..., 5] = y * c - z * b, z * a - x * c, x * b - y * a
+    return both
 
 
 def _covariance(jacobian: Array) -> Array | None:
@@ -448,10 +450,14 @@ def _inflation(misfit: float, degrees_of_freedom: int) -> float:
 
 
 def _body_by_placement(body: Array, camera: Array) -> Array:
-    """(6, 6): how the pose of a body at a place (3,) moves with that of a camera at another, both as position and
-    rotation along world axes."""
-    moved = np.eye(6)
-    moved[:3, 3:] = -skew(body - camera)
+    """(..., 6, 6): how the poses of bodies at places (..., 3) move with that of a camera at another, both as position
+    and rotation along world axes."""
+    x, y, z = np.moveaxis(body - camera, -1, 0)
+    moved = np.zeros((*body.shape[:-1], 6, 6))
+    moved[...] = np.eye(6)
+    # -[x]x
+    moved[..., 0, 4], moved[..., 0, 5], moved[..., 1, 5] = z, -y, x
+    moved[..., 1, 3], moved[..., 2, 3], moved[..., 2, 4] = -z, y, -x
     return moved
 
 

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera.edges import SIGMA_UNREFINED_PX, refine_corners
 from fusion.measurements import Array
 
 Image = NDArray[np.uint8]
@@ -28,11 +29,6 @@ DICTIONARIES = tuple(sorted({name.removeprefix("DICT_").upper() for name in dir(
 
 # Corners of the unit square in the order of a marker's
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
-
-# No corner is believed to be known better than this: lens model, flatness of the paper, print. px
-SIGMA_FLOOR_PX = 0.1
-# Sigma of the detector's own corners, used where a marker's edges could not be measured. px
-SIGMA_UNREFINED_PX = 0.8
 
 
 class DictionaryError(ValueError):
@@ -419,141 +415,3 @@ def _blur(cells: int, sigma: float) -> Array:
     left = np.array([[0.5 * (1.0 + math.erf((edge - at) / (sigma * math.sqrt(2.0)))) for edge in edges] for at in x])
     response: Array = np.diff(left, axis=1)
     return response
-
-
-# Edge refinement: profiles per leg, samples per profile. A leg is the part of a side next to a corner.
-_PROFILES, _SAMPLES = 12, 15
-# A leg begins this part of the side away from the corner, where the other leg's edge is out of the blur, ...
-_GAP, _GAP_PX = 0.08, 4.0
-# ... and is no longer than this, so that neither a lens nor wavy paper bends it: the rest of a long side says nothing
-# about its corner. px
-_LEG_PX = 36.0
-_ALONG = np.linspace(0.0, 1.0, _PROFILES, dtype=np.float32)
-_ACROSS = np.linspace(-1.0, 1.0, _SAMPLES, dtype=np.float32)
-# By corner, the corners where its two legs lead.
-_ENDS = np.array([[1, 3], [2, 0], [3, 1], [0, 2]])
-# Per leg: a leg's direction with x and y swapped, times this, points out of the square.
-_OUTWARD = np.array([[1.0, -1.0], [-1.0, 1.0]], np.float32)
-# How often the lines through the edges are fitted, each time with the weights that the last fit's residuals give.
-_ROUNDS = 3
-# A profile's rises times this are their sum and their first two moments about the profile's middle, ...
-_BETWEEN = 0.5 * (_ACROSS[1:] + _ACROSS[:-1])
-_MOMENTS = np.stack([np.ones_like(_BETWEEN), _BETWEEN, np.square(_BETWEEN)], axis=1)
-# ... and a profile times this is by how much its outer fifth is brighter than its inner one.
-_CONTRAST_ACROSS = np.where(np.abs(_ACROSS) > 0.6, np.sign(_ACROSS) / (_SAMPLES // 5), 0.0).astype(np.float32)[:, None]
-
-
-def refine_corners(
-    image: Image, corners_px: Array, cells: int, reach_px: Array | None = None
-) -> tuple[Array, Array, Array]:
-    """Measures corners on the edges of the black square.
-
-    (n, 4, 2) px, clockwise -> (n, 4, 2) px, (n,) sigma and (n,) sigma of the edges' blur, px. `cells`: of a marker's
-    side, its black border included. `reach_px` (n,): how far the corners may be off and the edge be blurred together,
-    where that is known. A marker whose sides do not show a clear edge from black to white, or whose corners would move
-    further than the profiles reach, keeps the corners it came with and SIGMA_UNREFINED_PX.
-    """
-    start = np.asarray(corners_px, dtype=np.float32)
-    cell = np.maximum(_shortest_sides(start) / cells, 1e-9)
-    # Half a profile stays within the black border inside and the white margin outside, each a cell wide.
-    furthest = np.maximum(0.8 * cell, 1.5)
-    reach = furthest if reach_px is None else np.minimum(np.maximum(reach_px, 1.5), furthest).astype(np.float32)
-    corners, noise, blur, clear = _refine_once(image, start, reach)
-    corners = np.where(clear[:, None, None], corners, start)
-    # Again: the detector's corners may be off by pixels, and a profile that is not centred pulls its edge to its own
-    # middle. Three sigma of the edge's own blur hold all of it, and a shorter profile is sampled more finely.
-    shorter = np.clip(3.0 * blur.max(axis=1), 1.5, 0.75 * furthest + 0.4)
-    shift = _furthest(corners - start)
-    again = np.flatnonzero((shift > 0.3 * reach) | (np.abs(shorter - reach) > 0.5 * reach))
-    if again.size:
-        corners[again], noise[again], blur[again], still_clear = _refine_once(image, corners[again], shorter[again])
-        clear[again] &= still_clear
-    clear &= _furthest(corners - start) <= np.maximum(furthest, 2.0)
-    # Blur brings the next cells' edges into the profile: on rendered markers of 13 to 70 px under blur of 0.5 to 5 px
-    # the corners' error is what the edges' width exceeds this part of a cell by.
-    crowding = np.maximum(blur - 0.185 * cell[:, None], 0.0)
-    sigma = np.sqrt(SIGMA_FLOOR_PX**2 + noise**2 + np.square(crowding).mean(axis=1))
-    sigma = np.where(clear, sigma, np.maximum(sigma, SIGMA_UNREFINED_PX))
-    refined: Array = np.where(clear[:, None, None], corners, np.asarray(corners_px, np.float64))
-    return refined, sigma.astype(np.float64), blur.max(axis=1).astype(np.float64)
-
-
-def _furthest(shift: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(n,) length of the longest of each four (n, 4, 2)."""
-    squares = np.square(shift)
-    return np.asarray(np.sqrt((squares[..., 0] + squares[..., 1]).max(axis=1)))
-
-
-def _refine_once(
-    image: Image, corners: NDArray[np.float32], reach: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """(n, 4, 2) corners, (n,) their sigma by the edges' scatter, (n, 8) sigma of the blur of each leg's edge, and
-    whether every leg had enough clear edges. `reach` (n,): half of a profile's length, px."""
-    n = len(corners)
-    # Two legs from each corner: to the next corner and to the one before. (n, 4, 2 legs, xy)
-    leg = corners[:, _ENDS] - corners[:, :, None]
-    length = np.maximum(np.hypot(leg[..., 0], leg[..., 1]), 1e-6)
-    along = leg / length[..., None]
-    # Out of the square, whose corners run clockwise in an image with y down: left of the one leg, right of the other.
-    outward = along[..., ::-1] * _OUTWARD
-
-    gap = np.minimum(_GAP * length, np.maximum(_GAP_PX, 0.7 * reach)[:, None, None])
-    u = gap[..., None] + np.minimum(length - 2.0 * gap, _LEG_PX)[..., None] * _ALONG
-    on_leg = corners[:, :, None, None] + u[..., None] * along[..., None, :]
-    off_leg = (reach[:, None] * _ACROSS)[:, None, None, :, None] * outward[..., None, :]
-    where = on_leg[..., None, :] + off_leg[:, :, :, None]
-    values = sample_image(image, where.reshape(n * 8, _PROFILES * _SAMPLES, 2), cv2.BORDER_REPLICATE)
-    profile = values.reshape(-1, _SAMPLES).astype(np.float32)
-
-    # The edge is the middle of the gradient. Only what grows brighter outwards and stands out counts: the rest is
-    # noise, and would pull the edge to the middle of the profile.
-    rise = profile[:, 1:] - profile[:, :-1]
-    rise -= np.maximum(0.15 * rise.max(axis=1, keepdims=True), 0.0)
-    moments = _product(np.maximum(rise, 0.0), _MOMENTS)
-    total = np.maximum(moments[:, 0], 1e-6)
-    middle = moments[:, 1] / total
-    spread = np.sqrt(np.maximum(moments[:, 2] / total - np.square(middle), 0.0))
-    edge = middle.reshape(n, 4, 2, _PROFILES) * reach[:, None, None, None]
-    blur = np.partition(spread.reshape(n, 8, _PROFILES), _PROFILES // 2, axis=-1)[..., _PROFILES // 2] * reach[:, None]
-    contrast = _product(profile, _CONTRAST_ACROSS).reshape(n, -1)
-    usual = np.partition(contrast, contrast.shape[1] // 2, axis=1)[:, contrast.shape[1] // 2]
-    valid = (contrast > np.maximum(0.4 * usual, 2.0)[:, None]).reshape(edge.shape)
-
-    # edge = offset + slope u along each leg, by least squares reweighted with Tukey's biweight
-    weight = valid.astype(np.float32)
-    terms = np.empty((5, *edge.shape), np.float32)
-    powers = np.stack([np.ones_like(u), u, np.square(u), edge, u * edge])
-    for _ in range(_ROUNDS):
-        np.multiply(weight, powers, out=terms)
-        s0, s1, s2, t0, t1 = terms.sum(axis=-1)
-        determinant = np.maximum(s0 * s2 - s1 * s1, 1e-3)
-        offset, slope = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
-        residual = edge - offset[..., None] - slope[..., None] * u
-        scale = 4.685 * np.maximum(1.4826 * _median_where(np.abs(residual), valid), 0.03)
-        weight = valid * np.square(np.maximum(1.0 - np.square(residual / scale[:, None, None, None]), 0.0))
-    support = weight.sum(axis=-1)
-    variance = (weight * np.square(residual)).sum(axis=(1, 2, 3)) / np.maximum(support.sum(axis=(1, 2)), 1e-6)
-    # Variance of a leg's offset at the corner over that of a profile; profiles within a pixel see the same noise.
-    at_corner = s2 / determinant * np.maximum(1.0, _PROFILES / np.minimum(length, _LEG_PX))
-    sigma = np.sqrt(variance * at_corner.mean(axis=(1, 2)))
-
-    # Where the lines of the two legs meet
-    on_line = corners[:, :, None] + offset[..., None] * outward
-    direction = along + slope[..., None] * outward
-    p, v, w = on_line[:, :, 0], direction[:, :, 0], direction[:, :, 1]
-    across = on_line[:, :, 1] - p
-    cross = v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]
-    part = (across[..., 0] * w[..., 1] - across[..., 1] * w[..., 0]) / np.where(np.abs(cross) < 1e-6, 1e-6, cross)
-    return p + part[..., None] * v, sigma, blur, (support > 0.4 * _PROFILES).all(axis=(1, 2))
-
-
-def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """a @ b. Not numpy's product: its BLAS wakes threads, which on a busy machine cost more than they bring."""
-    return np.asarray(cv2.gemm(a, b, 1.0, None, 0.0), np.float32)  # type: ignore[call-overload]
-
-
-def _median_where(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(n,) median over all but the first axis of the valid values; 0 where there is none."""
-    ordered = np.sort(np.where(valid, values, np.inf).reshape(len(values), -1), axis=1)
-    count = valid.reshape(len(values), -1).sum(axis=1)
-    return np.where(count > 0, ordered[np.arange(len(values)), count // 2], 0.0)

@@ -45,19 +45,18 @@ SEARCH_EVERY, SEARCH_INTERVAL = 10, 0.5
 
 # Around a marker's place: one window is enough for one that is sharp and well lit, three find most others.
 _NEARBY = (Pass(windows=(13, 13, 10), darker=10.0), Pass())
-# The whole picture: cheap, for markers whose sides are not short, whose sides are, and that are all but too small, ...
-_LARGE, _SMALL, _TINY = (
+# The whole picture: the cheap ways, which find nearly all sharp markers whose sides are long, short and tiny, px, ...
+_LONG, _SHORT, _TINY = (
     Pass(0.5, windows=(13, 13, 10), darker=10.0),
     Pass(windows=(13, 13, 10), darker=10.0),
     Pass(2.0, windows=(13, 23, 10)),
 )
-# ... with all that OpenCV's detector does by itself, ...
+_LONG_PX, _SHORT_PX = 25.0, 18.0
+# ... all that OpenCV's detector does by itself, ...
 _THOROUGH = Pass()
-# ... and, in turn, in the ways that find what is blurred or dark.
+# ... and, in turn, the ways that find what is blurred or dark, and what is that and tiny.
 _HARD = (Pass(0.5, equalise=True, windows=(13, 13, 10)), Pass(0.25), Pass(equalise=True))
-_HARD_AND_SMALL = (Pass(2.0, windows=(5, 45, 20)), *_HARD)
-# Sides from which on the cheap ways find every marker that is sharp, px.
-_LARGE_PX, _SMALL_PX = 25.0, 20.0
+_HARD_AND_TINY = (*_HARD, Pass(2.0, windows=(5, 45, 20)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +82,13 @@ class MarkerTracker:
     """Follows the markers `ids` of one dictionary; of those, `still` are at rest before a camera at rest.
 
     For one thread, like the MarkerDetector that it has. Raises what that raises.
-    `sides_px`: how long the shortest and the longest side of a marker may be, where that is known.
+    `sides_px`: how long the sides of the smallest and the largest marker are expected to be, where that is known.
     `repeated`: ids that the last search saw at several places, which are left out: which one is meant, nobody knows.
     """
 
     def __init__(self, dictionary: str, ids: Collection[int], still: Collection[int] = ()) -> None:
         self.ids = frozenset(ids)
-        self.sides_px = (SMALLEST_SIDE_PX, math.inf)
+        self.sides_px: tuple[float, float] | None = None
         self.repeated: frozenset[int] = frozenset()
         self._still = frozenset(still)
         self._detector = MarkerDetector(dictionary, ids)
@@ -138,24 +137,26 @@ class MarkerTracker:
         ]
 
     def _expected(self, t: float, predictions: Mapping[int, Prediction]) -> dict[int, Prediction]:
-        """Where to look: the best of what others predict and what the last frames tell."""
-        expected = {}
+        """Where to look: as predicted, unless what the last frames tell is better."""
+        expected = {id: where for id, where in predictions.items() if id in self.ids}
         for id, track in self._tracks.items():
             dt = t - track.t
-            if self._missed[id] > _GIVEN_UP or not (id in self._still or 0.0 <= dt <= REMEMBERED):
+            if id in expected and expected[id].sigma_px <= _SIGMA_PX:
                 continue
             if id in self._still:
-                expected[id] = Prediction(track.corners_px, _SIGMA_PX)
-            else:
+                own = Prediction(track.corners_px, _SIGMA_PX)
+            elif 0.0 <= dt <= REMEMBERED:
                 side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
-                sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
-                expected[id] = Prediction(track.corners_px + track.velocity_px * dt, sigma)
-        for id, prediction in predictions.items():
-            if id in self.ids and self._missed.get(id, 0) <= _GIVEN_UP:
-                own = expected.get(id)
-                if own is None or prediction.sigma_px <= own.sigma_px:
-                    expected[id] = prediction
-        return {id: where for id, where in expected.items() if id not in self.repeated}
+                own = Prediction(track.corners_px + track.velocity_px * dt, _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt)
+            else:
+                continue
+            if id not in expected or own.sigma_px < expected[id].sigma_px:
+                expected[id] = own
+        return {
+            id: where
+            for id, where in expected.items()
+            if id not in self.repeated and self._missed.get(id, 0) <= _GIVEN_UP
+        }
 
     def _follow(self, picture: Image, t: float, expected: Mapping[int, Prediction]) -> dict[int, Found]:
         """Those whose place and identity are known well enough for a look at their edges."""
@@ -198,14 +199,15 @@ class MarkerTracker:
 
     def _search(self, picture: Image, found: dict[int, Found]) -> dict[int, Found]:
         """The whole picture: cheaply, then with everything that the default detector does, then one way more."""
-        shortest = self.sides_px[0]
-        cheap = _LARGE if shortest >= _LARGE_PX else _SMALL if shortest >= _SMALL_PX else _TINY
-        hard = _HARD if shortest >= _SMALL_PX else _HARD_AND_SMALL
+        shortest, longest = self.sides_px or (math.inf, math.inf)
+        cheap = (_LONG, _SHORT) if shortest >= _LONG_PX else (_SHORT,) if shortest >= _SHORT_PX else (_TINY,)
+        hard = _HARD if self.sides_px is not None and shortest >= _SHORT_PX else _HARD_AND_TINY
+        bounds = (SMALLEST_SIDE_PX, math.inf) if self.sides_px is None else _about(shortest, longest)
         seen = list(found.values())
-        for way in (cheap, _THOROUGH, hard[next(self._searches) % len(hard)]):
+        for way in (*cheap, _THOROUGH, hard[next(self._searches) % len(hard)]):
             if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
-            seen = distinct(seen + self._detector.look(picture, way, _about(*self.sides_px)))
+            seen = distinct(seen + self._detector.look(picture, way, bounds))
             if self.ids <= {marker.id for marker in seen}:
                 break
         by_id: dict[int, list[Found]] = {}

@@ -25,7 +25,7 @@ DOORS = {
     "websockets": {"server/app.py", "server/robot_client.py", "server/remote_cameras.py", "server/camera_node.py"},
     "filterpy": {"fusion/reference.py"},
     "allantools": {"imu/allan.py"},
-    "numba": {"fusion/kernels.py"},
+    "numba": {"fusion/kernels.py", "camera/edges.py"},
 }
 # `fusion` is pure: time and data are arguments, and it returns instead of saying anything.
 IMPURE = {"asyncio", "logging", "os", "pathlib", "socket", "subprocess", "threading", "time", "datetime"}

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from camera.calibration import Intrinsics
-from camera.markers import MarkerDetector, refine_corners
+from camera.edges import refine_corners
+from camera.markers import MarkerDetector
 from camera.synthetic import Room
 from fusion.geometry import exp_so3, rotation_about_z, transform
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA
