@@ -124,7 +124,7 @@ class Camera:
         if not Path(config.calibration).is_file():
             raise CalibrationError(
                 f'camera "{config.name}": there is no calibration file {config.calibration}. It holds the '
-                "focal length and distortion of this very camera at this image size, and `steadfix calibrate` makes it; "
+                "focal length and distortion of this very camera at this image size; `steadfix calibrate` makes it. "
                 "example-camera.toml, beside example.toml, will do for a first try"
             )
         self.intrinsics = load_intrinsics(config.calibration)
