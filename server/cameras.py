@@ -158,6 +158,8 @@ class Camera:
         self._next_look = -math.inf
         self._settled = self.placement is not None
         self._moved = False
+        # The placement that the tracking knows the size of markers for.
+        self._sides_of: Placement | None = None
         # The anchors' corners while the camera hangs as it was found to, px, by id.
         self._at_rest: dict[int, Array] = {}
         self._arrivals: deque[float] = deque()
@@ -165,6 +167,11 @@ class Camera:
         self._stop = threading.Event()
         # A daemon: a driver that hangs must not keep the service from ending.
         self._thread = threading.Thread(target=self._run, name=f"camera {config.name}", daemon=True)
+
+    @property
+    def connected(self) -> bool:
+        """Whether frames come from where the camera is; of one that is here they do, or its source has raised."""
+        return True
 
     def start(self) -> None:
         self._thread.start()
@@ -215,7 +222,7 @@ class Camera:
                     return True
                 seen = self._see(frame)
                 # Not before: a frame of the wrong size is no success.
-                if self.status:
+                if self.status and self.connected:
                     log.info("camera %s: frames are coming", self.config.name)
                     self.status = ""
                 self._deliver(seen)
@@ -251,9 +258,30 @@ class Camera:
         t = frame.t + self.config.time_offset
         predictions = {}
         if (placement := self.placement) is not None:
+            if placement is not self._sides_of:
+                self._sides_of, self._tracking.sides_px = placement, self._sides_px(placement)
             poses = self._poses_at(t)
             predictions = predict(self._bodies, poses, self.intrinsics, placement.world_from_camera, frame.line_time)
         return self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
+
+    def _sides_px(self, placement: Placement) -> tuple[float, float]:
+        """How long the sides of the smallest and the largest marker appear, anywhere in the picture."""
+        mounts = [mount for body in self._bodies for mount in body.mounts.values()]
+        heights = [0.0, *(float(mount.body_from_marker[2, 3]) for mount in mounts)]
+        u, v = np.meshgrid(*(np.linspace(0.0, size - 1.0, 5) for size in self._image_size))
+        directions = (
+            rays(np.column_stack([u.ravel(), v.ravel()]), self.intrinsics) @ placement.world_from_camera[:3, :3].T
+        )
+        above = float(placement.world_from_camera[2, 3])
+        # m along the camera's axis to the floor; towards the horizon no marker is found anyway.
+        depth = above / np.maximum(-directions[:, 2], 1e-3)
+        furthest = min(float(depth.max()), 2.0 * float(np.median(depth)))
+        nearest = float(depth.min()) * (1.0 - max(heights) / above)
+        focal = float(self.intrinsics.camera_matrix[0, 0])
+        # What flies may come as near as it likes.
+        flying = not all(body.planar for body in self._bodies)
+        sizes = self._sizes.values()
+        return focal * min(sizes) / furthest, math.inf if flying or nearest <= 0.0 else focal * max(sizes) / nearest
 
     def _take_size(self, width_px: int, height_px: int) -> None:
         self.intrinsics.check_size(width_px, height_px)

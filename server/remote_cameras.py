@@ -79,7 +79,7 @@ class RemoteCamera(Camera):
         super().__init__(config, room, deliver, tracker_wanted, self._open_frames)
         self.status = (
             "its node has not connected yet; on the machine with the camera: "
-            f"steadfix camera --server ws://<this machine>:{room.server.port} --name {config.name}"
+            f"steadfix camera SOURCE --server ws://<this machine>:{room.server.port} --name {config.name}"
         )
         self.clock = DeviceClock()
         self.node = ""
@@ -93,6 +93,11 @@ class RemoteCamera(Camera):
     def _open_frames(self, config: CameraConfig) -> RemoteFrames:
         self._frames = RemoteFrames()
         return self._frames
+
+    @property
+    def connected(self) -> bool:
+        """Whether its node is there; a last frame may still be worked on when it has gone."""
+        return self._connection is not None
 
     def refusal(self, now: float) -> str:
         """Why no second connection can be this camera's, or "": one that is silent, as after a lost link, gives way."""
@@ -217,7 +222,7 @@ class RemoteCamera(Camera):
     def health(self, now: float) -> dict[str, Any]:
         delay = self.clock.minimum_delay
         return super().health(now) | {
-            "node": self.node if self._connection is not None else None,
+            "node": self.node if self.connected else None,
             "clock_skew_ppm": round(self.clock.skew * 1e6, 1),
             "link_delay_ms": None if delay is None else round(delay * 1e3, 2),
             "frames_dropped": self.dropped,
