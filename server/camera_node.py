@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable
@@ -132,12 +133,21 @@ class Watch:
 class Node:
     """The connection, and what is to go over it. `run` is the whole of it.
 
-    `url`: of the service, without a path. `open`: how to open the camera that the welcome describes; its frames are
-    stamped by `clock`. `dropped`: frames that were not sent.
+    `url`: of the service, without a path; wss:// where it has a certificate, and `certificate` is the path of that one
+    or of who has signed it, where nobody known has. `open`: how to open the camera that the welcome describes; its
+    frames are stamped by `clock`. `dropped`: frames that were not sent.
+
+    Raises NodeError for an address that is none and a certificate that cannot be read.
     """
 
     def __init__(
-        self, url: str, name: str, open: Open, token: str = "", clock: Callable[[], float] = time.monotonic
+        self,
+        url: str,
+        name: str,
+        open: Open,
+        token: str = "",
+        certificate: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         parts = urlsplit(url)
         if parts.scheme not in ("ws", "wss") or not parts.netloc:
@@ -145,6 +155,10 @@ class Node:
         self._url = url.rstrip("/") + "/v1/camera"
         self._name = name
         self._token = token
+        try:
+            self._tls = ssl.create_default_context(cafile=certificate) if parts.scheme == "wss" else None
+        except OSError as error:
+            raise NodeError(f"--certificate {certificate}: {error.strerror or error}") from None
         self._open = open
         self._clock = clock
         self.dropped = 0
@@ -175,6 +189,7 @@ class Node:
                     ping_interval=PING_INTERVAL,
                     ping_timeout=PING_TIMEOUT,
                     proxy=None,
+                    ssl=self._tls,
                 ) as connection:
                     await self._begin(connection)
                     welcomed = True
@@ -183,6 +198,11 @@ class Node:
                 reason = "the service has ended it"
             except ConnectionClosed as error:
                 reason = (error.rcvd and error.rcvd.reason) or "it was lost"
+            except ssl.SSLCertVerificationError as error:
+                raise NodeError(
+                    f"{self._url}: nobody known vouches for its certificate ({error.verify_message}); --certificate "
+                    "names one that is to be believed"
+                ) from None
             except (OSError, WebSocketException, MessageError) as error:
                 reason = getattr(error, "strerror", None) or str(error) or "no answer"
             if self._ended.is_set():
@@ -329,6 +349,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=os.environ.get("STEADFIX_TOKEN", ""),
         help="of the camera, where the service asks for one; others on this machine see it, but not in STEADFIX_TOKEN",
     )
+    parser.add_argument("--certificate", metavar="PATH", help="of the service, for wss://, where it has signed its own")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -352,5 +373,5 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def _run(args: argparse.Namespace, open: Open) -> None:
-    node = Node(args.server, args.name, open, args.token)
+    node = Node(args.server, args.name, open, args.token, args.certificate)
     await until_stopped(node.run())

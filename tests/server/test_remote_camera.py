@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from websockets.asyncio.client import ClientConnection
@@ -231,6 +232,23 @@ def test_who_is_no_remote_camera_is_refused(room: Config) -> None:
     run(main)
 
 
+def test_a_camera_with_a_token_is_taken_with_it_alone(room: Config) -> None:
+    secret = msgspec.structs.replace(room, camera=(msgspec.structs.replace(room.camera[0], token="swordfish"),))
+
+    async def main() -> None:
+        async with serving(secret) as service:
+            for more, says in (
+                ({}, "needs its token"),
+                ({"token": "sword"}, "not the token"),
+                ({"token": "swordfish"}, "welcome"),
+            ):
+                async with client(service, "/v1/camera") as connection:
+                    answer = await camera_hello(connection, **more)
+                    assert says in (answer["type"] + " " + answer.get("reason", ""))
+
+    run(main)
+
+
 def test_a_second_node_of_one_name_has_to_wait_until_the_first_is_silent(
     room: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -403,6 +421,8 @@ def test_a_camera_that_is_pulled_out_is_opened_again() -> None:
 
 def test_what_a_node_cannot_be_started_with() -> None:
     async def main() -> None:
+        with pytest.raises(NodeError, match=r"--certificate nothing.pem: No such file"):
+            Node("wss://there:5678", "ceiling", lambda welcome: Moving(), certificate="nothing.pem")
         for url in ("192.168.1.10:5678", "http://there:5678", "ws://", "there"):
             with pytest.raises(NodeError, match=r"--server .*: an address such as ws://192.168.1.10:5678 is needed"):
                 Node(url, "ceiling", lambda welcome: Moving())
