@@ -225,7 +225,7 @@ class StreamHealth:
         if parser.note:
             yield Finding("imu_degraded", "warning", f"{parser.protocol}: {parser.note}", {"protocol": parser.protocol})
         dropped = parser.dropped
-        share = dropped / max(1, self.samples + dropped)
+        share = dropped / max(1, parser.frames + dropped)
         if dropped and share >= DROPPED_SHARE:
             reason = parser.reasons.most_common(1)[0][0]
             text = f"{share:.0%} of what it sends cannot be used ({_words(reason)}); the latest is {parser.last_error}"
@@ -417,14 +417,16 @@ def _of_gravity(rest: Rest) -> Iterator[Finding]:
 
 def _of_time(rows: Array, steps: Array) -> Iterator[Finding]:
     """Stamps, gaps, and the pace of the device's clock against the host's."""
-    device, arrival = rows[:, _DEVICE], rows[:, _ARRIVAL]
-    span = float(arrival[-1] - arrival[0])
+    device = rows[:, _DEVICE]
+    # Of each arrival its newest sample, which took least.
+    newest = _newest(rows)
+    span = float(np.ptp(newest[:, _ARRIVAL])) if len(newest) else math.nan
     if np.isnan(device).all():
         if span >= 0.0:
             text = "it sends no time of its own: samples are stamped as they arrive, with all the jitter of the line"
             yield Finding("imu_unstamped", "note", text, {})
     else:
-        elapsed = float(device[-1] - device[0])
+        elapsed = float(newest[-1, _DEVICE] - newest[0, _DEVICE]) if len(newest) else math.nan
         forward = bool((np.diff(device) >= 0.0).all())
         if not (np.diff(device) != 0.0).any():
             text = f"its time stands still at {device[-1]:g} s"
@@ -433,7 +435,7 @@ def _of_time(rows: Array, steps: Array) -> Iterator[Finding]:
             times = elapsed / span
             units = next((f"these are {name}, not s" for one, name in CLOCK_UNITS if 0.8 < times / one < 1.25), "")
             text = f"its time runs {times:.3g} times as fast as it should{': ' if units else ''}{units}"
-            yield Finding("imu_clock", "error", text, {"times": times, "seconds": span})
+            yield Finding("imu_stamp_unit", "error", text, {"times": times, "seconds": span})
             return
     step = _step(rows)
     long = steps[steps > GAP * step]
@@ -463,13 +465,18 @@ def _step(rows: Array) -> float:
     return float(np.median(steps))
 
 
+def _newest(rows: Array) -> Array:
+    """The rows that are the newest of their arrival."""
+    arrival = rows[:, _ARRIVAL]
+    newest: Array = rows[(np.diff(arrival, append=np.inf) > 0.0) & np.isfinite(arrival)]
+    return newest
+
+
 def _arrivals(rows: Array) -> tuple[Array, Array]:
     """s between arrivals, and s that the newest sample of each took, by its stamp."""
-    arrival = rows[:, _ARRIVAL]
-    last = np.flatnonzero(np.diff(arrival, append=np.inf) > 0.0)
-    last = last[np.isfinite(arrival[last])]
-    intervals: Array = np.diff(arrival[last])
-    delays: Array = arrival[last] - rows[last, _T]
+    newest = _newest(rows)
+    intervals: Array = np.diff(newest[:, _ARRIVAL])
+    delays: Array = newest[:, _ARRIVAL] - newest[:, _T]
     return intervals, delays
 
 

@@ -39,9 +39,7 @@ from fusion.localiser import warm_up
 from fusion.measurements import Pose
 from fusion.params import Channel
 from imu.protocols import TIME_LIMIT
-from imu.protocols.csv_lines import CsvLines
-from imu.protocols.json_lines import JsonLines
-from imu.protocols.lines import LineParser
+from imu.protocols.detection import Detector, open_parser
 from imu.uart import SerialImu
 from server.access import bearer, is_local, is_loopback, origin_allowed, tls, token_matches
 from server.camera_messages import camera_hello
@@ -369,12 +367,17 @@ class Service:
     async def _read_port(self, robot: Robot) -> None:
         """The same until the port is lost (OSError) or cannot be opened (OSError, ValueError for the baud rate)."""
         name, imu = robot.config.name, robot.config.imu
-        parser: LineParser = CsvLines() if imu.protocol == "csv" else JsonLines()
+        parser = open_parser(imu.protocol, imu.columns, imu.baud)
+        port: SerialImu | None = None
         lost: asyncio.Future[None] = self._loop.create_future()
 
         def read(data: bytes, arrival: float) -> None:
-            dropped = parser.dropped
+            dropped, protocol = parser.dropped, parser.protocol
             samples = parser.feed(data)
+            if parser.protocol != protocol:
+                log.info("robot %s: %s speaks %s", name, imu.source, parser.protocol)
+            if isinstance(parser, Detector) and port is not None and parser.baud != port.baud:
+                port.set_baud(parser.baud)
             if parser.dropped > dropped:
                 if dropped == 0:
                     log.warning("robot %s: %s: %s", name, imu.source, parser.last_error)
@@ -392,7 +395,7 @@ class Service:
             SerialImu, imu.source, imu.baud, functools.partial(from_thread, read), functools.partial(from_thread, end)
         )
         try:
-            robot.connected()
+            robot.connected(parser, imu.source)
             log.info("robot %s: %s is open", name, imu.source)
             topics = [f"own/{name}"] if imu.pose_rate_hz > 0.0 else []
             with self.hub.subscribed(

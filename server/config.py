@@ -13,7 +13,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -21,6 +21,8 @@ from msgspec import Meta, Struct
 
 from fusion.params import Engine, FilterParams, Motion
 from imu.mounting import ImuCalibration
+from imu.protocols.csv_lines import ColumnsError, parse_columns
+from imu.protocols.detection import ProtocolName
 from server.access import HASHED
 
 DEFAULT_PORT = 5678
@@ -98,8 +100,11 @@ class MarkerConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
 class ImuConfig(ImuCalibration, frozen=True, forbid_unknown_fields=True):
     source: Text = "websocket"
-    protocol: Literal["json", "csv"] = "json"
+    protocol: ProtocolName = "json"
+    columns: str = ""
+    """Of CSV lines, where they are others than `t,gx,gy,gz,ax,ay,az`; imu/protocols/csv_lines.py says how."""
     baud: Annotated[int, Meta(ge=1200, le=12_000_000)] = 115200
+    """With the protocol "auto" the first that is tried."""
     pose_rate_hz: RateOrNone = 0.0
     """Poses sent back down a serial line; a WebSocket robot says its rate itself."""
 
@@ -161,7 +166,8 @@ _RIGHT = {
     "yaw_deg": "an angle in degrees, anticlockwise, -360 to 360",
     "motion": '"ground", "differential" or "free"',
     "engine": '"numba" or "filterpy"',
-    "protocol": '"json" or "csv"',
+    "protocol": " or ".join(f'"{name}"' for name in get_args(ProtocolName)),
+    "columns": 'the columns of CSV lines, such as "t[us],gx[deg/s],gy[deg/s],gz[deg/s],ax[g],ay[g],az[g]"',
     "baud": "the speed of the serial line in bits a second, such as 115200",
 }
 _SOURCE = {
@@ -238,6 +244,14 @@ def _check(config: Config, source: _Source) -> None:
             raise source.error(matrix, f"found {_shown(robot.imu.accel_matrix)}; needed: {_right(matrix)}")
         if robot.imu.source != "websocket":
             once("the serial port", robot.imu.source, ("robot", i, "imu", "source"))
+        if robot.imu.columns:
+            columns: KeyPath = ("robot", i, "imu", "columns")
+            if robot.imu.protocol not in ("csv", "auto"):
+                raise source.error(columns, f'the protocol "{robot.imu.protocol}" has none; "csv" has')
+            try:
+                parse_columns(robot.imu.columns)
+            except ColumnsError as error:
+                raise source.error(columns, str(error)) from None
     for given, other in (("certificate", "key"), ("key", "certificate")):
         if getattr(config.server, given) and not getattr(config.server, other):
             raise source.error(("server", given), f'the key "{other}" is missing: {_RIGHT[other]}')

@@ -145,7 +145,7 @@ class _Watch:
         elif self.is_port and (silence := time.monotonic() - self.heard) > SILENCE:
             text = f"nothing has come for {silence:.0f} s: is the device on, and are its TX and RX the right way round?"
             found.insert(0, Finding("imu_silent", "error", text, {"seconds": silence}))
-        elif self.health.samples == 0 and not found:
+        elif self.health.samples == 0 and (self.parser.frames or not found):
             text = f"{self.bytes} bytes, and no sample yet" if self.bytes else "nothing has come yet"
             if self.parser.frames:
                 text = f"{self.parser.protocol}: {self.parser.frames} messages, none with a sample of an IMU yet"

@@ -15,7 +15,9 @@ from fusion.health import Health
 from fusion.localiser import Localiser
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix
 from imu.clock import DeviceClock, Reading
+from imu.health import StreamHealth
 from imu.mounting import BodyReadings
+from imu.protocols import Parser
 from server.config import RobotConfig
 from server.messages import Dialect, PoseMessage, pose_message
 
@@ -45,6 +47,7 @@ class Robot:
         self.localiser = Localiser(config.name, config.filter, config.motion, config.engine)
         self.vitals = Health(self.localiser)
         self.diagnoses: list[Diagnosis] = []
+        self.stream = StreamHealth(upright=config.motion != "free")
         self.clock = DeviceClock()
         self._to_body = BodyReadings(config.imu)
         # Why no IMU data come, in words, or "" while they do.
@@ -57,9 +60,10 @@ class Robot:
         self._arrivals: deque[tuple[float, int]] = deque()
         self._told: set[tuple[str, str]] = set()
 
-    def connected(self) -> None:
-        """Its IMU is there, perhaps with a clock that has begun anew."""
+    def connected(self, parser: Parser | None = None, port: str = "") -> None:
+        """Its IMU is there, perhaps with a clock that has begun anew; with what reads its bytes, on a serial port."""
         self.clock = DeviceClock()
+        self.stream = StreamHealth(upright=self.config.motion != "free", parser=parser, port=port)
         self.vitals.another_imu()
         self._arrivals.clear()
         self.trouble = "it has connected, but sent no IMU data yet"
@@ -81,6 +85,7 @@ class Robot:
             # As the IMU gave them: how they become the body's is in the recording too.
             self._recording.imu(ImuBatch(self.config.name, now, readings))
         batch = ImuBatch(self.config.name, now, self._to_body(readings))
+        self.stream.feed(raw, batch.samples, arrival)
         track = np.full((len(raw), 8), np.nan)
         self.vitals.judged(self.localiser.feed(batch, track))
         self.vitals.sampled(batch.samples, track)
@@ -123,6 +128,12 @@ class Robot:
     def diagnose(self, now: float) -> list[str]:
         """Bring `diagnoses` up to date. -> what is new, for the log: each once when it comes and when it goes."""
         self.diagnoses = self.vitals.diagnoses(now)
+        said = {diagnosis.code for diagnosis in self.diagnoses}
+        # What needs no fixes to be seen.
+        for diagnosis in (Diagnosis(*finding) for finding in self.stream.findings() if finding.code not in said):
+            since, *_ = self.vitals.said.get(diagnosis.key, (now,))
+            self.vitals.said[diagnosis.key] = since, now, diagnosis
+            self.diagnoses.append(diagnosis)
         news = [diagnosis.text for diagnosis in self.diagnoses if diagnosis.key not in self._told]
         self._told.update(diagnosis.key for diagnosis in self.diagnoses)
         for key in sorted(self._told):

@@ -87,13 +87,16 @@ def test_a_diagnosis_is_in_the_health_and_told_once_when_it_comes_and_once_when_
         async with serving() as service:
             robot = service.robots["rover"]
             now = time.monotonic()
+            noise = np.random.default_rng(1)
 
             def on(seconds: float, one: float) -> None:
                 """An IMU at rest that reads gravity as `one`, and fixes, as fast as the filter takes them."""
                 nonlocal now
                 for _ in range(round(seconds / 0.5)):
                     stamps = (now + 0.01 * np.arange(50)).tolist()
-                    robot.feed_imu([RawSample(t, 0.0, 0.0, 0.0, 0.0, 0.0, one) for t in stamps], stamps[-1], stamps[-1])
+                    readings = noise.normal([0.0, 0.0, 0.0, 0.0, 0.0, one], 1e-3, (50, 6)).tolist()
+                    samples = [RawSample(t, *six) for t, six in zip(stamps, readings, strict=True)]
+                    robot.feed_imu(samples, stamps[-1], stamps[-1])
                     robot.feed_fix(replace(fix(), t=stamps[25]), stamps[-1])
                     now += 0.5
 

@@ -108,7 +108,13 @@ def test_the_example_is_accepted_with_everything_in_it_switched_on() -> None:
         ('calibration = "camera.toml"\n', "", ['"calibration" is missing', "example-camera.toml"]),
         ('source = "room.mp4"', "source = 1.5", ["found 1.5", "rtsp://"]),
         ("[[anchor]]\nid = 40\nsize_mm = 150\nposition_m = [0, 0, 0]\n", "", ["cameras need anchors"]),
-        ('source = "/dev/ttyUSB0"', 'source = "/dev/ttyUSB0"\nprotocol = "xml"', ['"xml"', '"json" or "csv"']),
+        ('source = "/dev/ttyUSB0"', 'source = "/dev/ttyUSB0"\nprotocol = "xml"', ['"xml"', '"auto" or "json"']),
+        (
+            'source = "/dev/ttyUSB0"',
+            'source = "/dev/ttyUSB0"\nprotocol = "csv"\ncolumns = "t,gx,gy"',
+            ['robot "rover", imu, columns', "no column for gz ax ay az"],
+        ),
+        ('source = "/dev/ttyUSB0"', 'source = "/dev/ttyUSB0"\ncolumns = "t,gx,gy"', ['the protocol "json" has none']),
         ("port = 0", "port = ", ["not valid TOML", "line 3"]),
     ],
 )  # fmt: skip
