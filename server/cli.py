@@ -22,6 +22,7 @@ COMMANDS = {
     "imu": ("server.imu", "what an IMU sends, live, and what is wrong with it"),
     "imu-rest": ("server.imu_rest", "an IMU's bias, scatter and mounting, from ten seconds at rest"),
     "imu-positions": ("server.imu_positions", "an accelerometer's bias and scale, from its six sides"),
+    "imu-mounting": ("server.imu_mounting", "how an IMU is turned on its robot, from a recorded drive"),
     "allan": ("server.allan", "an IMU's noise, from hours at rest"),
     "replay": ("server.replay", "run a recording through the filter again"),
     "markers": ("server.markers", "a sheet of markers to print"),
