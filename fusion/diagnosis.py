@@ -11,10 +11,10 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.geometry import rotation_from_quaternion
 from fusion.localiser import Localiser
@@ -27,7 +27,7 @@ WINDOW = 120.0  # s that a diagnosis looks back
 
 # --- When something is said: how large, and how significant ------------------------------------------------------
 SIGMAS = 5.0  # what is estimated with a sigma must be that many of them from what it should be
-OFFSET_LEAST = 0.005  # s of the stamps
+OFFSET_LEAST = 0.008  # s of the stamps
 TILT_LEAST = math.radians(0.3)
 TILT_CHI2 = 30.0  # 2 degrees of freedom: 3e-7
 NOISE_LEAST = 1.5  # times the noise that is configured, or that fixes say
@@ -39,7 +39,7 @@ STILL_RATE, STILL_FORCE = 0.02, 0.15  # rad/s, m/s2: a block at rest turns less,
 LEARNED_STEP, LEARNED_SPAN, LEARNED_LEAST = 0.25, 40.0, 2.0  # s between looks, s, times the IMU's noise
 PART_OF_FIX, PART_OF_IMU = 0.05, 0.2  # of the variance of an innovation, to learn about the one or the other
 TURNED_LEAST, TURNED_FIXES, TURNED_AGREE = math.radians(20.0), 8, 0.97  # agreement: length of the mean unit vector
-CAMERA_PAIRS, CAMERA_LEAST, CAMERA_APART = 10, 0.005, 0.25  # number, m, s
+CAMERA_LEAST = 0.005  # m between the fixes of cameras
 MISSING_LEAST, GAPS_LEAST, GAP = 0.01, 5, 1.75  # share, number, times the usual step
 REPEATS_LEAST = 0.01
 # A sensor at its limit reads one value again and again; rates and forces below these are no full scale of any.
@@ -52,8 +52,8 @@ UNIT_LEAST, UNIT_SIGMAS = 15.0, 8.0  # times what the fixes turn; of the correla
 STAMP_STEP = 0.5  # s: no IMU is slower
 CLOCKS_LEAST = 60.0  # s between the stamps of the IMU and of fixes
 # An offset of a marker or of the IMU on the robot: m; sigmas; its share of the innovations; fixes in all, of a marker.
-PLACE_LEAST, PLACE_SIGMAS, PLACE_SHARE, PLACE_FIXES, PLACE_GROUP = 0.015, 7.0, 0.15, 30, 10
-PLACE_TURN = math.radians(2.0)
+PLACE_LEAST, PLACE_SIGMAS, PLACE_SHARE, PLACE_FIXES, PLACE_GROUP = 0.015, 10.0, 0.2, 30, 10
+PLACE_TURN, PLACE_LIKELY = math.radians(2.0), 0.05  # and the share from which the filter's states are not told
 LATE_SHARE, LATE_FIXES, LATE_OF_BUFFER = 0.01, 3, 0.8
 NO_FIX = 5.0  # s
 RESETS = 2
@@ -86,17 +86,21 @@ class Diagnosis:
         return self.code, " ".join(str(self.evidence[name]) for name in ("source", "markers") if name in self.evidence)
 
 
+class Score(NamedTuple):
+    """How far a published pose was from a fix that came later: age of the last fix in it, s; m and rad."""
+
+    age: float
+    distance: float
+    angle: float
+
+
 class JudgedFix(NamedTuple):
-    """A fix: its outcome, the pose of it that was used, its markers; the pose (7,) published for it; the last fix in
-    that; how far it was off, m and rad."""
+    """A fix: its outcome, the pose of it that was used, its markers, and what poses were published for its instant."""
 
     outcome: FixOutcome
     pose: PoseHypothesis
     markers: tuple[int, ...]
-    published: Array | None
-    used: float
-    distance: float
-    angle: float
+    scores: tuple[Score | None, ...]
 
 
 class Chunk(NamedTuple):
@@ -156,11 +160,10 @@ def diagnose(seen: Seen) -> list[Diagnosis]:
         if codes & causes:
             # Much else is wrong then, but nothing of it is the cause.
             return [diagnosis for diagnosis in found if diagnosis.code in causes | besides]
-    odd = [*_of_turns(fixes), *_of_cameras(fixes, 2 if planar else 3)]
-    places = list(_of_places(seen, 2 if planar else 3))
+    odd, (places, likely) = list(_of_turns(fixes)), _of_places(seen, 2 if planar else 3)
     if not odd and not places:
         found += _of_learned(seen, codes)
-    if not places:
+    if not likely:
         # Where noise is understated, so are the filter's sigmas, also of what it has come to take for noise.
         noise = [diagnosis.evidence["times"] for diagnosis in found if diagnosis.code.endswith("_noise")]
         understated = max([1.0, *noise, *seen.localiser.noise_scale.tolist()])
@@ -231,21 +234,21 @@ def _of_samples(seen: Seen, blocks: Array, in_doubt: bool) -> Iterator[Diagnosis
 def _of_arrivals(seen: Seen) -> Iterator[Diagnosis]:
     """Of when fixes come, and whether they are of use."""
     localiser, fixes, lost, last = seen.localiser, seen.fixes, len(seen.lost), seen.localiser.last_fix
-    apart = 0.0
-    if seen.chunks:
-        apart = max(seen.stamps[0] - seen.chunks[-1].t, seen.began - seen.stamps[1])
-    if lost >= LATE_FIXES:
-        apart = max(apart, float(np.median(seen.lost)))
-    if CLOCKS_LEAST <= apart < math.inf:
-        text = f"the stamps of the fixes and of the IMU are {apart:.4g} s apart: two clocks, or two units?"
-        yield Diagnosis("fixes_clock", "error", text, {"apart_s": apart})
+    delays = [fix.outcome.delay for fix in fixes]
+    apart = max(seen.stamps[0] - seen.chunks[-1].t, seen.began - seen.stamps[1]) if seen.chunks else 0.0
+    delay = float(np.median([*delays, *seen.lost])) if len(fixes) + lost >= LATE_FIXES else 0.0
+    if max(apart, abs(delay)) >= CLOCKS_LEAST and seen.stamps[1] > -math.inf:
+        text = f"the fixes and the samples of the IMU are {apart:.4g} s apart by their stamps"
+        if apart < CLOCKS_LEAST:
+            text = f"fixes arrive {abs(delay):.4g} s {'after' if delay > 0.0 else 'before'} their stamps"
+        text += ": two clocks, or two units?"
+        yield Diagnosis("fixes_clock", "error", text, {"apart_s": apart, "delay_s": delay})
     age = seen.now - (last if math.isfinite(last) else seen.began)
     if age >= NO_FIX:
         ignored = sum(fix.outcome.t > last and fix.outcome.outcome is Outcome.REJECTED for fix in fixes)
         text = f"no fix for {age:.0f} s" if math.isfinite(last) else f"no fix yet, after {age:.0f} s"
         text += f": {ignored} came and were not believed" if ignored else ""
         yield Diagnosis("no_fix", "error", text, {"age_s": age, "not_believed": ignored})
-    delays = [fix.outcome.delay for fix in fixes]
     buffer = localiser.params.buffer
     if lost >= LATE_FIXES and lost >= LATE_SHARE * (lost + len(fixes)):
         text = f"{lost} of {lost + len(fixes)} fixes came later than the buffer of {buffer:g} s and are lost"
@@ -503,101 +506,157 @@ def _origin(source: str, markers: tuple[int, ...]) -> dict[str, Any]:
     return {"source": source} | ({"markers": list(markers)} if markers else {})
 
 
-def _of_places(seen: Seen, axes: int) -> Iterator[Diagnosis]:
-    """Where markers sit on the robot, or its IMU: an offset turns with the robot, and the prediction does not.
+class Innovations(NamedTuple):
+    """Of n fixes that are not far off in attitude, for what explains them.
 
-    What the filter makes of an offset is linear in it, nearly. That response is worked out for one unit along each
-    axis, and the offsets are those by which it explains the innovations best. They come out too small, since biases
-    take a part of them.
+    `markers`, `cameras`: those that occur often enough, the most frequent first; `marker`, `camera` (n,): whose each
+    is, -1 of the others. `used` (n,): whether it is to be explained. `value`, `variance`, `of_fix` (n, 6): the
+    innovation, its variance, and the part that the fix has in that, position and rotation.
     """
-    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2)]
-    count = Counter(fix.markers for fix in fixes)
-    groups = [markers for markers, n in count.most_common(4) if n >= PLACE_GROUP]
-    if len(fixes) < PLACE_FIXES or not groups:
-        return
-    group = np.array([groups.index(fix.markers) if fix.markers in groups else -1 for fix in fixes])
-    # Of groups that are too small no offset is worked out, and what came before the first fixes is not known.
-    used = (group >= 0) & (np.arange(len(fixes)) >= 5)
-    innovation = np.array([fix.outcome.innovation for fix in fixes])
-    variance = np.array([fix.outcome.innovation_sigma**2 for fix in fixes])
+
+    fixes: Sequence[JudgedFix]
+    markers: list[tuple[int, ...]]
+    marker: Array
+    cameras: list[str]
+    camera: Array
+    used: NDArray[np.bool_]
+    value: Array
+    variance: Array
+    of_fix: Array
+
+
+def _innovations(seen: Seen) -> Innovations | None:
+    """None where there are too few."""
+    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2) and not _is_turned(fix)]
+    markers, marker = _most([fix.markers for fix in fixes])
+    cameras, camera = _most([fix.outcome.source for fix in fixes])
+    # What the filter had of fixes before the first ones is not known.
+    used = (marker >= 0) & (camera >= 0) & (np.arange(len(fixes)) >= 5)
+    if np.sum(used) < PLACE_FIXES:
+        return None
     of_fix = np.array([np.diag(fix.pose.covariance) for fix in fixes])
     looks, scales = np.array([t for t, _ in seen.learned]), np.array([scale for _, scale in seen.learned])
     arrivals = [fix.outcome.arrival for fix in fixes]
-    for i, axis in enumerate((slice(0, 3), slice(3, 6)), start=2):  # as large as the filter took them for
-        of_fix[:, axis] *= np.maximum(1.0, np.interp(arrivals, looks, scales[:, i]))[:, np.newaxis] ** 2
+    for i, block in enumerate((slice(0, 3), slice(3, 6)), start=2):  # as large as the filter took them for
+        of_fix[:, block] *= np.maximum(1.0, np.interp(arrivals, looks, scales[:, i]))[:, np.newaxis] ** 2
+    value = np.array([fix.outcome.innovation for fix in fixes])
+    variance = np.array([fix.outcome.innovation_sigma**2 for fix in fixes])
+    return Innovations(fixes, markers, marker, cameras, camera, used, value, variance, of_fix)
 
-    effect = np.zeros((len(fixes), 3, axes * len(groups)))
-    world_from_body = np.array([rotation_from_quaternion(fix.pose.quaternion_wxyz) for fix in fixes])
-    for i in range(len(groups)):
-        effect[group == i, :, axes * i : axes * (i + 1)] = world_from_body[group == i, :, :axes]
-    moved = np.einsum("nij,nj->ni", world_from_body, innovation[:, :3])
-    gain = 1.0 - of_fix[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1)
-    response = _response(fixes, effect, gain, True)
-    sigma = np.sqrt(variance[:, :3].mean(axis=1))[:, np.newaxis]
-    offset, covariance, share = _explanation(
-        (response[:, :axes] / sigma[..., np.newaxis])[used], (moved[:, :axes] / sigma)[used]
-    )
-    found = []
-    for i, markers in enumerate(groups):
-        own = slice(axes * i, axes * (i + 1))
-        size = float(np.linalg.norm(offset[own]))
-        sigmas = math.sqrt(float(offset[own] @ np.linalg.solve(covariance[own, own], offset[own])))
+
+def _of_places(seen: Seen, axes: int) -> tuple[list[Diagnosis], bool]:
+    """Where markers sit on the robot, or its IMU, and whether cameras agree; and whether there may be more to that.
+
+    An offset on the robot turns with it, one between cameras comes and goes with them, and the prediction does neither.
+    What the filter makes of such a constant is linear in it, nearly. That response is worked out for one unit along
+    each axis, and the constants are those by which it explains the innovations best. Those on the robot come out too
+    small, since biases take a part of them.
+    """
+    of = _innovations(seen)
+    if of is None:
+        return [], False
+    world_from_body = np.array([rotation_from_quaternion(fix.pose.quaternion_wxyz) for fix in of.fixes])
+    on_robot = [_only(of.marker == i) * world_from_body[:, :, :axes] for i in range(len(of.markers))]
+    in_world = [_only(of.camera == i) * np.eye(3)[:, :axes] for i in range(1, len(of.cameras))]
+    total, own = of.variance[:, :3].mean(axis=1), of.of_fix[:, :3].mean(axis=1)
+    accel = seen.localiser.params.accel_noise * max(1.0, float(np.median([scale[0] for _, scale in seen.learned])))
+    response = _response(of.fixes, np.concatenate([*on_robot, *in_world], axis=2), total, own, accel)[:, :axes]
+    moved = np.einsum("nij,nj->ni", world_from_body, of.value[:, :3])[:, :axes]
+    offset, covariance, share = _explanation(response, moved, total, of.used)
+
+    parts = []
+    for i in range(len(on_robot) + len(in_world)):
+        at = slice(axes * i, axes * (i + 1))
+        sigmas = math.sqrt(float(offset[at] @ np.linalg.solve(covariance[at, at], offset[at])))
+        parts.append((offset[at], float(np.linalg.norm(offset[at])), sigmas))
+    said: list[Diagnosis] = []
+    off, likely = [], False
+    for markers, (by, size, sigmas) in zip(of.markers, parts, strict=False):
+        likely |= share >= PLACE_LIKELY and size >= PLACE_LEAST and sigmas >= SIGMAS
         if share >= PLACE_SHARE and size >= PLACE_LEAST and sigmas >= PLACE_SIGMAS:
-            found.append((size, sigmas, markers, offset[own]))
-    for size, sigmas, markers, by in found:
+            off.append((markers, by, size, sigmas))
+    for markers, by, size, sigmas in off:
         axis = int(np.argmax(np.abs(by)))
         way = (("back", "right", "down"), ("front", "left", "up"))[int(by[axis] > 0.0)][axis]
-        name = _named(markers) if len(groups) > 1 else "the marker"
-        text = f"{name} sits {1e3 * size:.0f} mm or more farther to the {way} of the robot than is entered"
-        text += ", or the IMU as much to the other side" if len(groups) == len(found) else ""
-        evidence: dict[str, Any] = {"markers": list(markers)} if len(groups) > 1 else {}
-        evidence |= {"mm": (1e3 * by).tolist(), "sigmas": sigmas, "explained": share, "fixes": count[markers]}
-        yield Diagnosis("marker_place", "warning", text, evidence)
+        several = len(of.markers) > 1
+        text = (
+            f"{_named(markers) if several else 'the marker'} sits {1e3 * size:.0f} mm or more farther to the {way} of "
+        )
+        text += "the robot than is entered"
+        text += ", or the IMU as much to the other side" if len(off) == len(of.markers) else ""
+        evidence: dict[str, Any] = {"markers": list(markers)} if several else {}
+        evidence |= {"mm": (1e3 * by).tolist(), "sigmas": sigmas, "explained": share}
+        said.append(Diagnosis("marker_place", "warning", text, evidence))
+    for camera, (by, size, sigmas) in zip(of.cameras[1:], parts[len(of.markers) :], strict=True):
+        if size >= CAMERA_LEAST and sigmas >= PLACE_SIGMAS:
+            text = f"fixes of camera {camera} disagree with those of camera {of.cameras[0]} by {1e3 * size:.0f} mm"
+            evidence = {"source": f"{of.cameras[0]}, {camera}", "mm": (1e3 * by).tolist(), "sigmas": sigmas}
+            said.append(Diagnosis("cameras_disagree", "warning", text, evidence))
+    said += _of_headings(of)
+    return said, likely or bool(said)
 
-    # About the vertical, against the marker that is seen most.
-    effect = (group[:, np.newaxis] == np.arange(1, len(groups)))[:, np.newaxis].astype(np.float64)
-    response = _response(fixes, effect, 1.0 - of_fix[:, 5] / variance[:, 5], False)
-    sigma = np.sqrt(variance[:, 5:])
-    offset, covariance, share = _explanation(
-        (response / sigma[..., np.newaxis])[used], (innovation[:, 5:] / sigma)[used]
-    )
-    for i, markers in enumerate(groups[1:]):
-        turn, sigmas = abs(float(offset[i])), abs(float(offset[i])) / math.sqrt(covariance[i, i])
+
+def _of_headings(of: Innovations) -> Iterator[Diagnosis]:
+    """Are markers turned about the vertical against the one that is seen most?"""
+    effect = np.concatenate([_only(of.marker == i) for i in range(len(of.markers))], axis=2)[:, :, 1:]
+    total, own = of.variance[:, 5], of.of_fix[:, 5]
+    response = _response(of.fixes, effect, total, own, 0.0)
+    turns, covariance, share = _explanation(response, of.value[:, 5:], total, of.used)
+    for i, markers in enumerate(of.markers[1:]):
+        turn = abs(float(turns[i]))
+        sigmas = turn / math.sqrt(covariance[i, i])
         if share >= PLACE_SHARE and PLACE_TURN <= turn < TURNED_LEAST and sigmas >= PLACE_SIGMAS:
-            names, degrees = f"{_named(groups[0])} and {_named(markers)}", math.degrees(turn)
+            degrees = math.degrees(turn)
             text = (
-                f"{names} disagree by {degrees:.1f} deg: one of them is turned on the robot otherwise than is entered"
+                f"{_named(of.markers[0])} and {_named(markers)} disagree by {degrees:.1f} deg: one of them is turned "
             )
-            evidence = {"markers": [*groups[0], *markers], "turn_deg": degrees, "sigmas": sigmas, "explained": share}
-            yield Diagnosis("marker_turn", "warning", text, evidence | {"fixes": count[markers]})
+            text += "on the robot otherwise than is entered"
+            evidence = {"markers": [*of.markers[0], *markers], "turn_deg": degrees, "sigmas": sigmas}
+            yield Diagnosis("marker_turn", "warning", text, evidence | {"explained": share})
 
 
-def _response(fixes: Sequence[JudgedFix], effect: Array, gain: Array, speeds: bool) -> Array:
+def _only(which: Array) -> Array:
+    return which[:, np.newaxis, np.newaxis].astype(np.float64)
+
+
+def _most(names: Sequence[Any]) -> tuple[list[Any], Array]:
+    """The up to four that occur often enough, the most frequent first, and the place there (n,) of each; -1: none."""
+    often = [name for name, n in Counter(names).most_common(4) if n >= PLACE_GROUP]
+    return often, np.array([often.index(name) if name in often else -1 for name in names])
+
+
+def _response(fixes: Sequence[JudgedFix], effect: Array, total: Array, of_fix: Array, accel_noise: float) -> Array:
     """(n, a, m): by how much innovations are off, for each of m constants that move fixes by `effect` (n, a, m) a unit.
 
-    By the gain (n,) of each update alone, and where the filter follows with its speed, with the gain for that in a
-    steady state: P. Kalata, "The tracking index", IEEE Transactions on Aerospace and Electronic Systems 20(2), 1984.
+    What an update does is known from the variances (n,) of the innovation and of the fix; how the speed follows, from
+    a filter of place and speed alone with `accel_noise`, a density, whose variance of the place is made what is known.
     """
-    gain = np.clip(gain, 0.02, 0.99)
-    of_speed = 2.0 * (2.0 - gain) - 4.0 * np.sqrt(1.0 - gain)
-    moved, speed, before = effect[0].copy(), np.zeros_like(effect[0]), fixes[0].outcome.t
+    of_state = np.maximum(total - of_fix, 0.02 * total)
+    steps = np.diff([fix.outcome.t for fix in fixes], prepend=fixes[0].outcome.t).tolist()
+    moved, speed = effect[0].copy(), np.zeros_like(effect[0])
     response = np.zeros_like(effect)
-    for i, fix in enumerate(fixes):
-        outcome = fix.outcome
-        step = max(outcome.t - before, 1e-3)
-        before = outcome.t
-        moved = moved + step * speed
+    p, c, v = of_state[0], 0.0, 0.0  # the covariance: of the place, of both, of the speed
+    for i, (fix, dt) in enumerate(zip(fixes, steps, strict=True)):
+        moved = moved + dt * speed
+        p, c, v = p + dt * (2.0 * c + dt * v) + accel_noise**2 * dt**3 / 3.0, c + dt * v, v
+        c, v = c + accel_noise**2 * dt**2 / 2.0, v + accel_noise**2 * dt
+        p, c, v = (x * of_state[i] / p for x in (p, c, v))
         response[i] = effect[i] - moved
-        if outcome.outcome in BELIEVED:
-            moved = moved + gain[i] * response[i]
-            speed = speed + of_speed[i] / step * response[i] if speeds else speed
-        elif outcome.outcome is not Outcome.REJECTED:
+        outcome = fix.outcome.outcome
+        if outcome in BELIEVED:
+            gain, of_speed = p / (p + of_fix[i]), c / (p + of_fix[i])
+            moved, speed = moved + gain * response[i], speed + of_speed * response[i]
+            p, c, v = (1.0 - gain) * p, (1.0 - gain) * c, v - of_speed * c
+        elif outcome is not Outcome.REJECTED:
             moved, speed = effect[i].copy(), np.zeros_like(speed)
+            p, c, v = of_fix[i], 0.0, 1.0
     return response
 
 
-def _explanation(A: Array, b: Array) -> tuple[Array, Array, float]:
-    """x (m,) with A x nearest to b, A (n, a, m), b (n, a), its covariance, and the share of b that it explains."""
+def _explanation(response: Array, value: Array, variance: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, float]:
+    """The constants (m,) whose `response` (n, a, m) is nearest to `value` (n, a), their covariance, and its share."""
+    sigma = np.sqrt(variance[used])[:, np.newaxis]
+    A, b = response[used] / sigma[..., np.newaxis], value[used] / sigma
     weight = np.ones(len(b))
     for _ in range(8):  # Huber's weights: a flipped or a strayed fix says little
         weighted = A * weight[:, np.newaxis, np.newaxis]
@@ -608,34 +667,6 @@ def _explanation(A: Array, b: Array) -> tuple[Array, Array, float]:
         weight = np.minimum(1.0, 3.0 / np.maximum(np.linalg.norm(residual, axis=1), 1e-9))
     left, whole = (float(np.sum(weight[:, np.newaxis] * r**2)) for r in (residual, b))
     return x, np.linalg.inv(normal) * max(1.0, left / b.size), 1.0 - left / whole if whole > 0.0 else 0.0
-
-
-def _of_cameras(fixes: Sequence[JudgedFix], axes: int) -> Iterator[Diagnosis]:
-    """Do fixes of different cameras agree that lie close together in time, but for the motion between them?"""
-    differences: dict[tuple[str, str], list[Array]] = {}
-    for a, b in pairwise(fixes):
-        if a.outcome.source == b.outcome.source or b.outcome.t - a.outcome.t > CAMERA_APART:
-            continue
-        # Between the published poses there must be no correction.
-        if a.published is None or b.published is None or a.used != b.used:
-            continue
-        step = (b.pose.position - a.pose.position) - (b.published[:3] - a.published[:3])
-        names = a.outcome.source, b.outcome.source
-        differences.setdefault((min(names), max(names)), []).append((step if names[0] < names[1] else -step)[:axes])
-    for (first, second), steps in differences.items():
-        step = np.array(steps)
-        middle = np.median(step, axis=0)
-        # sigma of a median from the median deviation: 1.2533 * 1.4826 / sqrt(n)
-        sigma = 1.86 * np.median(np.abs(step - middle), axis=0) / math.sqrt(len(step))
-        size = float(np.linalg.norm(middle))
-        sigmas = float(np.max(np.abs(middle) / np.maximum(sigma, 1e-6)))
-        if len(step) >= CAMERA_PAIRS and size >= CAMERA_LEAST and sigmas >= SIGMAS:
-            text = f"fixes of camera {second} disagree with those of camera {first} by {1e3 * size:.0f} mm"
-            evidence = {
-                "source": f"{first}, {second}", "mm": (1e3 * middle).tolist(), "sigma_mm": (1e3 * sigma).tolist(),
-                "pairs": len(step), "sigmas": sigmas,
-            }  # fmt: skip
-            yield Diagnosis("cameras_disagree", "warning", text, evidence)
 
 
 def _rotation(a: Array, b: Array) -> Array:

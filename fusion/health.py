@@ -4,10 +4,10 @@
 there; all else is done when it is asked. What it says is about the last two minutes.
 
 **Accuracy without ground truth.** A fix judges the pose that was published for its instant before the fix had arrived:
-the ring keeps what was published. The innovation would not do, since it is computed after rewinding, when fixes that
-arrived after the publication are in the state. The difference holds the fix's own error too, so that it errs to the
-safe side. Fixes that are not believed count when the filter gives in to them later, for then it was the pose that
-was wrong.
+a ring keeps what was published, of the channel that was. The innovation would not do, since it is computed after
+rewinding, when fixes that arrived after the publication are in the state. The difference holds the fix's own error
+too, so that it errs to the safe side. Fixes that are not believed count when the filter gives in to them later, for
+then it was the pose that was wrong.
 """
 
 from __future__ import annotations
@@ -21,60 +21,109 @@ from typing import Any
 import numpy as np
 
 from fusion.consistency import chi2_bounds
-from fusion.diagnosis import BELIEVED, BLOCK, GAP, LEARNED_STEP, WINDOW, Chunk, Diagnosis, JudgedFix, Seen, diagnose
+from fusion.diagnosis import (
+    BELIEVED,
+    BLOCK,
+    GAP,
+    LEARNED_STEP,
+    WINDOW,
+    Chunk,
+    Diagnosis,
+    JudgedFix,
+    Score,
+    Seen,
+    diagnose,
+)
 from fusion.localiser import Localiser
-from fusion.measurements import Array, FixOutcome, Outcome, PoseFix, PoseHypothesis
+from fusion.measurements import Array, FixOutcome, Outcome, Pose, PoseFix, PoseHypothesis
+from fusion.params import Channel
 
 NIS_FIXES = 60  # fixes of the running NIS
 AGES = (0.2, 0.7, 1.7, 4.7)  # s: between the buckets of fix age; not the usual intervals of fixes themselves
 
-_KEEP = 4096  # rows that stay when the ring is full: the filter's own ring holds as many
-_T, _U, _PUBLISHED, _USED = 0, 1, 7, 15
+_KEEP = 4096  # rows that stay when a ring is full: the filter's own ring holds as many
+
+
+class _Poses:
+    """Poses that were given out, and the last fix in each."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((2 * _KEEP, 9))
+        self._instants = self._rows[:, 0]
+        self._end = 0
+
+    def add(self, poses: Array, last_fix: float) -> None:
+        """Rows (n, 8) of t, position, quaternion wxyz, n <= _KEEP."""
+        n = len(poses)
+        if self._end + n > len(self._rows):
+            self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
+            self._end = _KEEP
+        rows = self._rows[self._end : self._end + n]
+        rows[:, :8], rows[:, 8] = poses, last_fix
+        self._end += n
+
+    def at(self, t: float, longest: float) -> tuple[Array, float] | None:
+        """The pose (7,) for instant t and the last fix in it; None if there was none, in a gap longer than that, s."""
+        after = bisect_left(self._instants, t, 0, self._end)
+        if not 0 < after < self._end:
+            return None
+        a, b = self._rows[after - 1], self._rows[after]
+        span = b[0] - a[0]
+        if not (math.isfinite(a[1]) and span <= longest):
+            return None
+        # Successive quaternions are nearly the same: a line will do.
+        return a[1:8] + (t - a[0]) / span * (b[1:8] - a[1:8]), float(a[8])
 
 
 class Health:
     """The figures of one robot. Tell it in this order, around feeding the localiser:
 
-    `arrived(fix)` before a fix is fed; `judged(outcomes)` after; `sampled(samples, track)` after samples are.
+    `arrived(fix)` before a fix is fed; `judged(outcomes)` after; `sampled(samples, track)` after samples are. `channel`
+    is that of the track. Where poses are published apart from it, on the smooth channel, `published(pose)`.
     """
 
-    def __init__(self, localiser: Localiser) -> None:
+    def __init__(self, localiser: Localiser, channel: Channel = "best") -> None:
         self.localiser = localiser
         self.reordered = 0
         # By key: when it was first and last said, and how it was said last.
         self.said: dict[tuple[str, str], tuple[float, float, Diagnosis]] = {}
         self._planar = localiser.motion != "free"
-        self._rows = np.empty((2 * _KEEP, 16))
-        self._instants = self._rows[:, _PUBLISHED]
+        self._rows = np.empty((2 * _KEEP, 7))
         self._end = self._digested = 0
         self._began = self._t_before = math.nan
         self._last_fix = -math.inf
         self._oldest, self._newest = math.inf, -math.inf  # stamps of fixes
         self._chunks: deque[Chunk] = deque()
-        self._arriving: dict[tuple[str, float, float], tuple[PoseFix, Array | None, float]] = {}
+        self._arriving: dict[tuple[str, float, float], tuple[PoseFix, list[tuple[Array, float] | None]]] = {}
         self._fixes: deque[JudgedFix] = deque(maxlen=400)
         self._learned: deque[tuple[float, Array]] = deque(maxlen=round(WINDOW / LEARNED_STEP))
         self._late: deque[FixOutcome] = deque(maxlen=400)
         self._doubtful: deque[JudgedFix] = deque(maxlen=100)
-        self._accuracy: list[deque[JudgedFix]] = [deque(maxlen=400) for _ in range(len(AGES) + 1)]
+        # What was given out, and of each the fixes' scores by fix age: along the track, and apart from it.
+        self._channels: tuple[Channel, Channel] = (channel, "smooth")
+        self._given = _Poses(), _Poses()
+        self._scores = tuple([deque[Score](maxlen=400) for _ in range(len(AGES) + 1)] for _ in self._given)
 
     # Looking on
 
     def sampled(self, samples: Array, track: Array) -> None:
         """Samples (n, 7) that were fed, and the track (n, 8) of it: what was published with each."""
         for at in range(0, len(samples), _KEEP):
-            part, n = samples[at : at + _KEEP], min(_KEEP, len(samples) - at)
+            n = min(_KEEP, len(samples) - at)
             if self._end + n > len(self._rows):
                 self._digest()
                 self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
                 self._digested -= self._end - _KEEP
                 self._end = _KEEP
-            rows = self._rows[self._end : self._end + n]
-            rows[:, :_PUBLISHED] = part
-            rows[:, _PUBLISHED:_USED] = track[at : at + _KEEP]
-            rows[:, _USED] = self._last_fix
+            self._rows[self._end : self._end + n] = samples[at : at + _KEEP]
             self._end += n
+            self._given[0].add(track[at : at + _KEEP], self._last_fix)
         self._last_fix = self.localiser.last_fix
+
+    def published(self, pose: Pose) -> None:
+        """A pose that was given out, later than the one before."""
+        row = np.concatenate([[pose.t], pose.position, pose.quaternion_wxyz])
+        self._given[1].add(row[np.newaxis], pose.t - pose.fix_age)
 
     def another_imu(self) -> None:
         """The device has connected anew, or it is another one: what the last one sent is no measure for it."""
@@ -87,7 +136,8 @@ class Health:
         if fix.t < self._newest:
             self.reordered += 1
         self._oldest, self._newest = min(self._oldest, fix.t), max(self._newest, fix.t)
-        self._arriving[fix.source, fix.t, fix.arrival] = (fix, *self._published(fix.t + self.localiser.time_offset))
+        t, longest = fix.t + self.localiser.time_offset, self.localiser.params.imu_gap
+        self._arriving[fix.source, fix.t, fix.arrival] = fix, [poses.at(t, longest) for poses in self._given]
         if len(self._arriving) > 256:
             del self._arriving[next(iter(self._arriving))]
 
@@ -101,9 +151,9 @@ class Health:
                 self._late.append(outcome)
             if known is None:
                 continue
-            fix, published, used = known
+            fix, given = known
             pose = fix.hypotheses[outcome.hypothesis]
-            self._score(JudgedFix(outcome, pose, fix.markers, published, used, *self._difference(pose, published)))
+            self._score(JudgedFix(outcome, pose, fix.markers, tuple(self._compared(outcome.t, pose, g) for g in given)))
             if not self._learned or abs(outcome.arrival - self._learned[-1][0]) >= LEARNED_STEP:
                 self._learned.append((outcome.arrival, self.localiser.noise_scale))
         self._last_fix = self.localiser.last_fix
@@ -116,36 +166,25 @@ class Health:
             return
         before = list(self._doubtful) if outcome is Outcome.REINITIALISED else []
         self._doubtful.clear()
-        for scored in (*before, fix):
-            if scored.published is not None:
-                self._accuracy[bisect_left(AGES, scored.outcome.t - scored.used)].append(scored)
+        for judged in (*before, fix):
+            for scores, score in zip(self._scores, judged.scores, strict=True):
+                if score is not None:
+                    scores[bisect_left(AGES, score.age)].append(score)
 
-    def _published(self, t: float) -> tuple[Array | None, float]:
-        """The pose (7,) that was published for instant t, and the last fix in it; None if there was none."""
-        after = bisect_left(self._instants, t, 0, self._end)
-        if not 0 < after < self._end:
-            return None, math.nan
-        a, b = self._rows[after - 1, _PUBLISHED:], self._rows[after, _PUBLISHED:]
-        span = b[0] - a[0]
-        if not (math.isfinite(a[1]) and span <= self.localiser.params.imu_gap):
-            return None, math.nan
-        # The quaternions of successive samples are nearly the same: a line will do.
-        pose: Array = a[1:8] + (t - a[0]) / span * (b[1:8] - a[1:8])
-        return pose, float(a[8])
-
-    def _difference(self, pose: PoseHypothesis, published: Array | None) -> tuple[float, float]:
-        """m and rad; on the floor, and about the vertical, for a robot that stays there."""
-        if published is None:
-            return math.nan, math.nan
-        x, y, z, pw, px, py, pz = published.tolist()
+    def _compared(self, t: float, pose: PoseHypothesis, given: tuple[Array, float] | None) -> Score | None:
+        """Only on the floor, and about the vertical, for a robot that stays there."""
+        if given is None:
+            return None
+        (x, y, z, pw, px, py, pz), used = given[0].tolist(), given[1]
         fx, fy, fz = pose.position.tolist()
         qw, qx, qy, qz = pose.quaternion_wxyz.tolist()
         w = pw * qw + px * qx + py * qy + pz * qz
         c = pw * qz - pz * qw + py * qx - px * qy
         if self._planar:
-            return math.hypot(fx - x, fy - y), 2.0 * math.atan2(abs(c), abs(w))
+            return Score(t - used, math.hypot(fx - x, fy - y), 2.0 * math.atan2(abs(c), abs(w)))
         a, b = pw * qx - px * qw - py * qz + pz * qy, pw * qy - py * qw - pz * qx + px * qz
-        return math.hypot(fx - x, fy - y, fz - z), 2.0 * math.atan2(math.hypot(a, b, c), abs(w))
+        distance = math.hypot(fx - x, fy - y, fz - z)
+        return Score(t - used, distance, 2.0 * math.atan2(math.hypot(a, b, c), abs(w)))
 
     def _digest(self) -> None:
         """Make a chunk of the rows since the last one."""
@@ -154,7 +193,7 @@ class Health:
             return
         rows = self._rows[self._digested : self._digested + count * BLOCK]
         self._digested += count * BLOCK
-        t = rows[:, _T]
+        t = rows[:, 0]
         if math.isnan(self._t_before):
             self._t_before = float(t[0])
             self._began = self._t_before if math.isnan(self._began) else self._began
@@ -171,7 +210,7 @@ class Health:
         absent = float(np.sum(steps / usual)) - int(np.sum(steps > 0.0))
         missing = max(0.0, min(float(np.sum(np.round(long / beside) - 1.0)), absent))
         # One row an axis: reductions along what lies side by side in memory are several times as fast.
-        u = rows[:, _U:_PUBLISHED].T.copy()
+        u = rows[:, 1:].T.copy()
         size = np.abs(u)
         top = size.max(axis=1)
         at_top = np.count_nonzero(size >= (1.0 - 1e-6) * top[:, np.newaxis], axis=1)
@@ -184,7 +223,7 @@ class Health:
             np.einsum("ijk,ijk->ij", first, first) / (2.0 * (BLOCK - 1)),
             np.einsum("ijk,ijk->ij", third, third) / (20.0 * (BLOCK - 3)),
         )
-        blocks = np.vstack([rows[::BLOCK, _T], rows[BLOCK - 1 :: BLOCK, _T], *means]).T
+        blocks = np.vstack([rows[::BLOCK, 0], rows[BLOCK - 1 :: BLOCK, 0], *means]).T
         longest, repeats = float(long.max(initial=0.0)), int(np.sum(steps == 0.0))
         chunk = Chunk(
             self._t_before, len(steps), step, missing, len(long), longest, repeats, top, at_top, near_top, blocks
@@ -201,8 +240,9 @@ class Health:
         delays = [fix.outcome.delay for fix in self._fixes]
         tilt_sigma = np.sqrt(np.diag(localiser.tilt_covariance))
         age = now - localiser.last_fix
-        scored = [fix for bucket in self._accuracy for fix in bucket]
         edges = (0.0, *AGES, None)
+        published = int(any(self._scores[1]))
+        by_age = self._scores[published]
         return {
             "nis": {name: self._nis(name) for name in ("pose", "position", "attitude")},
             "time_offset_ms": 1e3 * localiser.time_offset,
@@ -216,11 +256,11 @@ class Health:
             "fix_age_s": age if math.isfinite(age) else None,
             "fix_delay_ms": {"p50": _percentile(delays, 50, 1e3), "p95": _percentile(delays, 95, 1e3)},
             "fixes_reordered": self.reordered,
-            "accuracy": _accuracy(scored)
+            "accuracy": {"channel": self._channels[published]}
+            | _accuracy([score for scores in by_age for score in scores])
             | {
                 "by_fix_age": [
-                    {"from_s": edges[i], "to_s": edges[i + 1]} | _accuracy(bucket)
-                    for i, bucket in enumerate(self._accuracy)
+                    {"from_s": edges[i], "to_s": edges[i + 1]} | _accuracy(scores) for i, scores in enumerate(by_age)
                 ]
             },
         }
@@ -262,11 +302,11 @@ def _percentile(values: Sequence[float], percent: float, scale: float) -> float 
     return scale * float(np.percentile(values, percent)) if values else None
 
 
-def _accuracy(scored: Sequence[JudgedFix] | deque[JudgedFix]) -> dict[str, Any]:
-    mm, deg = [fix.distance for fix in scored], [fix.angle for fix in scored]
+def _accuracy(scores: Sequence[Score] | deque[Score]) -> dict[str, Any]:
+    mm, deg = [score.distance for score in scores], [score.angle for score in scores]
     degrees = math.degrees(1.0)
     return {
-        "fixes": len(scored),
+        "fixes": len(scores),
         "mm_p50": _percentile(mm, 50, 1e3),
         "mm_p95": _percentile(mm, 95, 1e3),
         "deg_p50": _percentile(deg, 50, degrees),

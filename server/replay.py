@@ -234,7 +234,7 @@ def run(args: argparse.Namespace) -> int:
             continue
         if engine == "numba":
             _compile()
-        health = Health(Localiser(recording.name, params, motion, engine))
+        health = Health(Localiser(recording.name, params, motion, engine), args.channel)
         with tqdm(
             total=len(recording.samples), unit=" samples", delay=1.0, leave=False, disable=not sys.stderr.isatty()
         ) as bar:

@@ -105,6 +105,7 @@ class Robot:
         pose = self.localiser.pose_at(now, "smooth")
         if pose is not None:
             self.published += 1
+            self.vitals.published(pose)
         return pose
 
     def message(self, pose: Pose, now: float) -> PoseMessage:

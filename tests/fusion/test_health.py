@@ -205,7 +205,7 @@ FAULTS = {
     "milliseconds of the IMU": Fault(
         "imu_stamp_unit", lambda s: in_milliseconds(drive(s), fix=False), "step", 4.9, 5.1
     ),
-    "milliseconds of fixes": Fault("fixes_clock", lambda s: in_milliseconds(drive(s), imu=False), "apart_s", 100, 500),
+    "milliseconds of fixes": Fault("fixes_clock", lambda s: in_milliseconds(drive(s), imu=False), "delay_s", 100, 500),
     "two clocks": Fault(
         "fixes_clock",
         lambda s: fixes(drive(s), lambda f: replace(f, t=f.t + 1.7e9, arrival=f.arrival + 1.7e9)),
@@ -214,10 +214,12 @@ FAULTS = {
         1.8e9,
     ),
     "stamps of another clock": Fault(
-        "fixes_clock", lambda s: fixes(drive(s), lambda f: replace(f, t=f.t - 1e4)), "apart_s", 9.9e3, 1.01e4
+        "fixes_clock", lambda s: fixes(drive(s), lambda f: replace(f, t=f.t - 1e4)), "delay_s", 9.9e3, 1.01e4
     ),
     "marker turned": Fault("fixes_turned", lambda s: marked(s, 180.0), "turn_deg", 175, 180),
-    "marker turned a little": Fault("marker_turn", lambda s: marked(s, 8.0), "turn_deg", 7.0, 9.5),
+    "marker turned a little": Fault(
+        "marker_turn", lambda s: marked(s, 8.0), "turn_deg", 7.0, 10.5, besides=frozenset({"resets"})
+    ),
     "marker displaced": Fault("marker_place", lambda s: marked(s, shift=(0.0, 0.08, 0.0)), "mm", 60, 100),
     "the only marker displaced": Fault(
         "marker_place", lambda s: marked(s, shift=(0.1, 0.0, 0.0), share=1.0), "mm", 35, 110
@@ -239,8 +241,9 @@ FAULTS = {
         besides=frozenset({"fix_position_noise"}),
     ),
 }
-# What cannot be told from every drive: how wrong a scale is is drawn, and here the draw is of a wrong one.
-SEEDS = {"wrong scale": (0, 1)}
+# What cannot be told from every drive: how wrong a scale is is drawn, and here the draw is of a wrong one; and on some
+# courses biases take the most of a displacement.
+SEEDS = {"wrong scale": (0, 1), "the only marker displaced": (0, 1, 2)}
 
 
 def check(fault: Fault, seed: int) -> None:
@@ -363,6 +366,39 @@ def test_accuracy_is_that_of_what_was_published():
     assert 1e3 * np.median(error.position) < accuracy["mm_p50"]
 
 
+def test_accuracy_is_of_the_channel_that_is_published():
+    """Poses are asked for ahead of the IMU, as by the service; the score is that of these, not of the filter's own."""
+    simulation = drive(3, 60.0, imu=ImuParams(latency=0.02), camera=CameraParams(rate=5.0))
+    health = Health(Localiser("robot", FilterParams(time_offset_sigma=0.0)))
+    published, waiting, distances = [], list(simulation.fixes), []
+    for i in range(0, len(simulation.samples), 4):
+        now = simulation.arrival[i + 3 : i + 4]
+        if not len(now):
+            break
+        track = np.empty((4, 8))
+        health.localiser.feed_samples(simulation.samples[i : i + 4], track)
+        health.judged(health.localiser.judged())
+        health.sampled(simulation.samples[i : i + 4], track)
+        while waiting and waiting[0].arrival <= now[0]:
+            fix = waiting.pop(0)
+            if len(published) > 1 and published[0][0] < fix.t:
+                at = interpolate(np.array(published), np.array([fix.t]))[0]
+                distances.append(np.linalg.norm(at[1:3] - fix.hypotheses[0].position[:2]))
+            health.arrived(fix)
+            health.judged(health.localiser.feed(fix))
+        pose = health.localiser.pose_at(now[0], "smooth")
+        if pose is not None:
+            health.published(pose)
+            published.append([pose.t, *pose.position, *pose.quaternion_wxyz])
+    accuracy = health.figures(60.0)["accuracy"]
+    assert accuracy["channel"] == "smooth"
+    assert accuracy["fixes"] == len(distances) > 250
+    assert accuracy["mm_p50"] == pytest.approx(1e3 * np.percentile(distances, 50), rel=1e-6)
+    assert accuracy["mm_p95"] == pytest.approx(1e3 * np.percentile(distances, 95), rel=1e-6)
+    # Without anyone who listens it is that of the track.
+    assert watch(simulation).figures(60.0)["accuracy"]["channel"] == "best"
+
+
 def test_rejects_count_when_the_filter_gives_in():
     """A robot that was carried away was wrong by 2 m; a turned marker does not make its poses wrong."""
 
@@ -371,7 +407,7 @@ def test_rejects_count_when_the_filter_gives_in():
 
     health = watch(fixes(drive(5), carried))
     assert health.localiser.counts["reinitialised"] == 1
-    assert max(fix.distance for bucket in health._accuracy for fix in bucket) > 1.9
+    assert max(score.distance for scores in health._scores[0] for score in scores) > 1.9
     health = watch(FAULTS["turned"].simulate(5))
     assert health.localiser.counts["rejected"] > 10
     assert health.figures(90.0)["accuracy"]["deg_p95"] < 5.0
