@@ -52,7 +52,7 @@ FULL_SCALE, BEYOND = 35.0, 3
 TILT, WRONG_AXIS = math.radians(15.0), math.radians(45.0)
 
 # Gravity's turning against the gyroscope's: s between looks, rad in all that are needed, and how well they must agree.
-TURN_STEP, TURN_LEAST, TURN_AGREE, TURN_DISAGREE = 0.1, 1.0, 0.9, 0.5
+TURN_STEP, TURN_LEAST, TURN_AGREE, TURN_DISAGREE = 0.1, 1.0, 0.9, 0.75
 
 # Identical readings at the end, of both sensors or of one; some gyroscopes are set to send zeros at rest.
 STUCK_SAMPLES, STUCK_SECONDS, STUCK_SECONDS_OF_ONE = 25, 0.5, 2.0
