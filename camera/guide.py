@@ -115,7 +115,7 @@ class Guide:
         outline = _outline(self.board, camera_from_board, camera)
         elsewhere = all(stance.is_new_beside(other) for other in self._stances)
         reaches = ((coverage([view]) > 0) & (coverage(self.used) == 0)).any()
-        new = (elsewhere or reaches) and not any(map(view.same_as, self.views))
+        new = bool(elsewhere or reaches) and not any(map(view.same_as, self.views))
         kept = new and before is not None and _is_still(before, view)
         if kept:
             self._keep(view, stance)

@@ -3,23 +3,48 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import datetime
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
 from camera.boards import DEFAULT_BOARD, BoardDetector, BoardView, parse_board
-from camera.calibration import Calibration, CalibrationError, Criterion, calibrate, judge, save_intrinsics
-from camera.capture import IMAGE_SUFFIXES, read_image
+from camera.calibration import Calibration, CalibrationError, Criterion, calibrate, coverage, judge, save_intrinsics
+from camera.capture import IMAGE_SUFFIXES, FrameSource, open_source, read_image
+from camera.guide import Guide, Step
+from camera.markers import Pixels, grey
+from server.calibration_page import CalibrationPage
+
+DEFAULT_PORT = 5679
+# s without a frame after which a camera counts as lost; s before it is tried again, doubled up to the longest.
+READ_TIMEOUT, FIRST_PAUSE, LONGEST_PAUSE = 5.0, 1.0, 30.0
+# s without the board after which the picture is searched for what is there instead; that takes a while.
+_PUZZLED = 3.0
+# s between two pictures for the page, and px that they are across at most.
+_PICTURE_INTERVAL, _PICTURE_PX = 0.1, 960
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.add_argument("images", nargs="*", metavar="IMAGE", help="pictures of the board, or folders of them")
+    parser.add_argument(
+        "--source",
+        metavar="SOURCE",
+        help='a live camera instead, guided: 0, "/dev/video2", "rtsp://...", "picamera", or a video or folder as one',
+    )
+    parser.add_argument("--width-px", type=int, default=0, metavar="W", help="asked of the live camera")
+    parser.add_argument("--height-px", type=int, default=0, metavar="H", help="asked of the live camera")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the guiding page (default: %(default)s)")
+    parser.add_argument(
+        "--port", type=int, default=DEFAULT_PORT, help="its port, 0 for any free one (default: %(default)s)"
+    )
     parser.add_argument(
         "--board",
         default=DEFAULT_BOARD,
@@ -36,10 +61,19 @@ def run(args: argparse.Namespace) -> int:
     """Runs the command. Returns 0 if the calibration was written; 1 if it was refused, or a picture could not be read;
     2 for arguments that cannot be followed."""
     board = parse_board(args.board)
-    if not args.images:
+    if bool(args.images) == (args.source is not None):
         return _fail("name pictures of the board, or --source for a live camera", 2)
     if args.out.is_dir() or not args.out.absolute().parent.is_dir():
         return _fail(f"--out {args.out}: a file in a folder that is there is needed", 2)
+    if args.source is not None:
+        guided = _Guided(args, Guide(board))
+        try:
+            return asyncio.run(guided.run())
+        except KeyboardInterrupt:
+            if not args.force:
+                _say(f"stopped with {len(guided.guide.views)} views: {args.out} is not written")
+                raise
+            return _finish(args, guided.guide.used, guided.guide.calibration, "too few views")
     views, failed = _views(_files(args.images), BoardDetector(board))
     try:
         calibration = calibrate(board, views)
@@ -79,6 +113,111 @@ def _views(files: Iterator[Path], detector: BoardDetector) -> tuple[list[BoardVi
             views.append(view)
     _say(f"the board is in {len(views)} of {count} pictures")
     return views, failed
+
+
+class _Guided:
+    """The live camera with its guide, on the terminal and on the page."""
+
+    def __init__(self, args: argparse.Namespace, guide: Guide) -> None:
+        self.guide = guide
+        self._args = args
+        self._detector = BoardDetector(guide.board)
+        self._said = ""
+        self._boardless = time.monotonic()
+        self._puzzle = ""
+        self._next_picture = 0.0
+
+    async def run(self) -> int:
+        """Until it is good enough, or the source has ended. Returns the exit status."""
+        source: FrameSource | None = await asyncio.to_thread(self._open)
+        pause = FIRST_PAUSE
+        async with CalibrationPage(self._args.host, self._args.port) as page:
+            _say(f"http://{self._args.host}:{page.port}/ shows the picture and what to do; so do these lines")
+            if self._args.host not in ("127.0.0.1", "localhost", "::1"):
+                _say("anyone on this network can see the picture")
+            try:
+                while not self.guide.done:
+                    try:
+                        if source is None:
+                            source = await asyncio.to_thread(self._open)
+                        frame = await asyncio.to_thread(source.read, READ_TIMEOUT)
+                    except OSError as error:
+                        if source is not None:
+                            await asyncio.to_thread(source.close)
+                            source = None
+                        self._tell(f"{error}; trying again")
+                        await page.show(self._state(Step(f"The camera is gone: {error}"), "trouble"), b"")
+                        await asyncio.sleep(pause)
+                        pause = min(2.0 * pause, LONGEST_PAUSE)
+                        continue
+                    if frame is None:
+                        self._tell("the source has ended")
+                        break
+                    pause = FIRST_PAUSE
+                    step = await asyncio.to_thread(self._see, frame.image)
+                    picture = await asyncio.to_thread(self._picture, frame.image) if page.watched else b""
+                    await page.show(self._state(step, "kept" if step.kept else "", frame.image), picture)
+            finally:
+                if source is not None:
+                    # Also wakes the thread that waits for a frame.
+                    source.close()
+            status = _finish(self._args, self.guide.used, self.guide.calibration, "too few views")
+            text = f"Done: {self._args.out} is written" if status == 0 else "Not good enough: see the terminal"
+            await page.show(self._state(Step(text), "done" if status == 0 else "trouble", ended=True), b"")
+        return status
+
+    def _open(self) -> FrameSource:
+        return open_source(self._args.source, width_px=self._args.width_px, height_px=self._args.height_px)
+
+    def _see(self, image: Pixels) -> Step:
+        """One picture, told on the terminal."""
+        view = self._detector.find(image, f"view {len(self.guide.views) + 1}", thorough=False)
+        step = self.guide.feed(view)
+        now = time.monotonic()
+        if view is not None:
+            self._boardless, self._puzzle = now, ""
+        elif now - self._boardless > _PUZZLED:
+            self._boardless, self._puzzle = now, self._detector.what_is_there(image)
+        if self._puzzle:
+            step = Step(f"{step.text}: {self._puzzle}")
+        if step.kept:
+            met = sum(criterion.met for criterion in self.guide.criteria)
+            self._tell(f"view {len(self.guide.views)} is taken, {met} of {len(self.guide.criteria)} conditions are met")
+        self._tell(step.text)
+        return step
+
+    def _tell(self, text: str) -> None:
+        """Once."""
+        if text != self._said:
+            self._said = text
+            _say(text)
+
+    def _picture(self, image: Pixels) -> bytes:
+        now = time.monotonic()
+        if now < self._next_picture:
+            return b""
+        self._next_picture = now + _PICTURE_INTERVAL
+        picture = grey(image)
+        scale = min(1.0, _PICTURE_PX / picture.shape[1])
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
+
+    def _state(
+        self, step: Step, state: str = "", image: Pixels | None = None, *, ended: bool = False
+    ) -> dict[str, Any]:
+        """For the page; places as parts of the picture."""
+        size = (1.0, 1.0) if image is None else (image.shape[1], image.shape[0])
+        return {
+            "board": str(self.guide.board),
+            "text": step.text,
+            "state": state,
+            "ended": ended,
+            "views": len(self.guide.views),
+            "cells": (coverage(self.guide.used) > 0).tolist(),
+            "criteria": [{"met": c.met, "part": c.part, "text": c.text} for c in self.guide.criteria],
+            "outline": None if step.outline_px is None else (step.outline_px / size).tolist(),
+            "target": None if step.target_px is None else (step.target_px / size).tolist(),
+        }
 
 
 def _finish(args: argparse.Namespace, views: Sequence[BoardView], calibration: Calibration | None, trouble: str) -> int:

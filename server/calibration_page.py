@@ -1,0 +1,134 @@
+"""The page of `steadfix calibrate`: the live picture, what to do next, and how far it is."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http
+from email.utils import formatdate
+from importlib.resources import files
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import msgspec
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+_WEBSOCKET = "/v1/calibration"
+_PAGE = {
+    "/": ("calibrate.html", "text/html; charset=utf-8"),
+    "/calibrate.css": ("calibrate.css", "text/css; charset=utf-8"),
+    "/calibrate.js": ("calibrate.js", "text/javascript; charset=utf-8"),
+    "/dashboard.css": ("dashboard.css", "text/css; charset=utf-8"),
+    "/favicon.svg": ("favicon.svg", "image/svg+xml"),
+}
+# s that viewers get to take the last word before they are cut off.
+_LAST_WORD = 2.0
+
+
+class CalibrationPage:
+    """`async with CalibrationPage(host, port) as page:` serves it on `page.port`; `page.show(...)` sends each viewer
+    the newest state, and the picture that belongs to it. A slow viewer skips states.
+
+    Raises OSError when the port cannot be had.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self.port = port
+        self._host = host
+        self._files = {
+            path: (files("server").joinpath("dashboard", name).read_bytes(), kind)
+            for path, (name, kind) in _PAGE.items()
+        }
+        self._changed = asyncio.Condition()
+        self._state = b""
+        self._picture = b""
+        self._count = 0
+        self._ending = False
+        self._viewers: set[asyncio.Task[Any]] = set()
+        self._server: Server | None = None
+
+    async def __aenter__(self) -> Self:
+        self._server = await serve(
+            self._serve,
+            self._host,
+            self.port,
+            process_request=self._answer,
+            compression=None,
+            max_size=1024,
+            server_header=None,
+        )
+        self.port = self._server.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        async with self._changed:
+            self._ending = True
+            self._changed.notify_all()
+        if self._viewers:
+            await asyncio.wait(self._viewers, timeout=_LAST_WORD)
+        assert self._server is not None
+        self._server.close()
+        await self._server.wait_closed()
+
+    @property
+    def watched(self) -> bool:
+        """Whether anybody looks at it."""
+        return bool(self._viewers)
+
+    async def show(self, state: dict[str, Any], picture: bytes) -> None:
+        """`state` as the script of the page reads it, `picture` a JPEG, b"" for the one before."""
+        async with self._changed:
+            self._state = msgspec.json.encode(state)
+            self._picture = picture or self._picture
+            self._count += 1
+            self._changed.notify_all()
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._viewers.add(task)
+        shown = 0
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                while True:
+                    async with self._changed:
+                        while self._count == shown and not self._ending:
+                            await self._changed.wait()
+                        if self._count == shown:
+                            return
+                        shown, state, picture = self._count, self._state, self._picture
+                    await connection.send(state, text=True)
+                    if picture:
+                        await connection.send(picture)
+        finally:
+            self._viewers.discard(task)
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        path = urlsplit(request.path).path
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            return None if path == _WEBSOCKET else _response(404, b"", "text/plain", request)
+        if path in self._files:
+            return _response(200, *self._files[path], request)
+        return _response(404, b"The page is at /\n", "text/plain; charset=utf-8", request)
+
+
+def _response(status: int, body: bytes, kind: str, request: Request) -> Response:
+    headers = Headers(
+        {
+            "Date": formatdate(usegmt=True),
+            "Connection": "close",
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-cache",
+            "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws: wss:",
+            "X-Content-Type-Options": "nosniff",
+        }
+    )
+    status_line = http.HTTPStatus(status)
+    return Response(status_line.value, status_line.phrase, headers, b"" if request.method == "HEAD" else body)
