@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from camera.markers import Pixels
-from camera.stamp import host_clocks, host_time
+from camera.stamp import StreamClock, host_clocks, host_time
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
@@ -335,16 +335,22 @@ class NetworkCamera:
             raise OSError(
                 f"camera {self._name}: no answer within {NETWORK_TIMEOUT:g} s; check address, user and password"
             )
+        # RTP's stamps are of the camera's clock (RFC 3550, section 5.1); those of other streams FFmpeg makes up.
+        self._clock = StreamClock() if url.startswith("rtsp") else None
 
     def grab(self) -> Frame:
-        """See Device. `t` is the arrival: what the network and the camera's encoder take is in no stamp."""
-        if not self._capture.grab():
-            raise OSError(f"camera {self._name}: lost; it no longer delivers frames")
-        arrival = time.monotonic()
+        """See Device. `t` is too late by what the promptest frame takes, which is in no stamp."""
+        t = None
+        while t is None:
+            if not self._capture.grab():
+                raise OSError(f"camera {self._name}: lost; it no longer delivers frames")
+            t = time.monotonic()
+            if self._clock is not None:
+                t = self._clock.host_time(1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC), t)
         ok, image = self._capture.retrieve()
         if not ok:
             raise OSError(f"camera {self._name}: lost; it delivers frames that cannot be decoded")
-        return Frame(arrival, np.asarray(image))
+        return Frame(t, np.asarray(image))
 
     def close(self) -> None:
         self._capture.release()

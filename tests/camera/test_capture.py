@@ -1,4 +1,5 @@
 import logging
+import random
 import threading
 import time
 
@@ -8,6 +9,7 @@ import pytest
 
 from camera import capture
 from camera.capture import FileSource, Frame, LiveSource, V4l2Device, open_source, read_image, without_password
+from tests.camera.rtsp import NetworkCamera
 
 WAIT = 20.0
 
@@ -281,6 +283,34 @@ def test_a_usb_camera_is_left_alone_where_nothing_is_asked(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", webcam)
     V4l2Device(0)
     assert webcam.set_in_order == []
+
+
+def test_a_network_camera_is_stamped_by_its_own_clock_and_missed_when_it_hangs_up():
+    """A real RTSP stream, whose frames leave the camera up to 80 ms after they were taken."""
+    begin = time.monotonic()
+    chance = random.Random(1)
+
+    def due(k):
+        time.sleep(max(0.0, begin + 0.1 * k + chance.choice((0.0, 0.08)) - time.monotonic()))  # the camera's pace
+
+    camera = NetworkCamera(lambda k: np.full((48, 64, 3), 10 + k, np.uint8), lambda k: 500.0 + 0.1 * k, due)
+    try:
+        source = open_source(camera.url)
+        frames = [source.read(WAIT) for _ in range(12)]
+        late = [frame.t - begin - 0.1 * round(float(frame.image.mean()) - 10) for frame in frames]
+        # By what the promptest took, and by nothing of what each took.
+        assert min(late) >= 0.0
+        assert np.diff(late).max() < 1e-3
+        camera.hang_up()
+        with pytest.raises(OSError, match=r"camera rtsp://127.0.0.1:\d+/stream: lost; it no longer delivers frames"):
+            numbers(source)
+        source.close()
+        # It is there again.
+        again = open_source(camera.url)
+        assert again.read(WAIT) is not None
+        again.close()
+    finally:
+        camera.close()
 
 
 def test_passwords_are_not_shown():

@@ -1,9 +1,10 @@
 import math
+import random
 import time
 
 import pytest
 
-from camera.stamp import OLDEST, host_clocks, host_time
+from camera.stamp import LATEST, OLDEST, WINDOW, StreamClock, host_clocks, host_time
 
 
 @pytest.mark.parametrize("clock", ["monotonic", "boot time", "wall"])
@@ -36,3 +37,50 @@ def test_the_clocks_of_this_machine():
     t, name = host_time(clocks["wall"] - 0.2, clocks)
     assert name == "wall"
     assert t == pytest.approx(clocks["monotonic"] - 0.2, abs=1e-6)
+
+
+def stream(clock, frames):
+    """(stamp, arrival) -> what the clock makes of them."""
+    return [clock.host_time(stamp, arrival) for stamp, arrival in frames]
+
+
+def test_a_stream_is_stamped_as_evenly_as_its_camera_does_it():
+    """Frames are 20 to 100 ms under way; the stamps' only error is what the promptest took."""
+    chance = random.Random(3)
+    taken = [500.0 + 0.04 * k for k in range(1000)]
+    frames = [(t - 480.0, t + chance.uniform(0.02, 0.1)) for t in taken]
+    # The first is of the backlog, as far as anybody knows; the promptest has come within two seconds.
+    found = stream(StreamClock(), frames)
+    late = [t - true for t, true in zip(found[1:], taken[1:], strict=True)]
+    assert max(late[50:]) < 0.03
+    assert min(late) >= 0.02 - 1e-9
+
+
+def test_the_backlog_of_a_stream_that_is_opened_is_left_out():
+    backlog = [(0.1 * k, 2.0 + 0.001 * k) for k in range(20)]
+    live = [(0.1 * k, 0.03 + 0.1 * k) for k in range(20, 40)]
+    found = stream(StreamClock(), backlog + live)
+    assert found[:20] == [None] * 20
+    assert found[21:] == pytest.approx([arrival for _, arrival in live[1:]])
+
+
+def test_a_stream_that_stalls_is_stamped_when_it_was_taken():
+    clock = StreamClock()
+    stream(clock, [(0.1 * k, 7.0 + 0.1 * k) for k in range(20)])
+    assert stream(clock, [(2.0 + 0.1 * k, 12.0 + 0.001 * k) for k in range(20)]) == pytest.approx(
+        [9.0 + 0.1 * k for k in range(20)]
+    )
+
+
+def test_a_slow_crystal_and_a_clock_that_is_set_are_followed():
+    clock = StreamClock()
+    *_, last = stream(clock, [(0.04 * k * (1.0 - 1e-4), 0.04 * k) for k in range(20_000)])
+    assert last == pytest.approx(0.04 * 19_999, abs=1.1e-4 * WINDOW)
+    assert clock.host_time(5.0, 801.0) == pytest.approx(801.0), "set back"
+    assert clock.host_time(5.04, 801.04 + LATEST + 1.0) == pytest.approx(802.04 + LATEST), "no frame is so late"
+
+
+def test_a_stream_without_stamps_is_stamped_on_arrival():
+    assert stream(StreamClock(), [(0.0, 5.0 + 0.1 * k) for k in range(200)])[1:] == pytest.approx(
+        [5.0 + 0.1 * k for k in range(1, 200)]
+    )
