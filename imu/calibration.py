@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 
 from fusion.measurements import Array
 from fusion.params import GRAVITY
+from imu.health import UNITS
 
 # Rest is judged over windows of WINDOW s by the scatter of the means over BLOCK s, in which noise and the shaking of a
 # fan are small, but not a hand's tremor (4 to 10 Hz).
@@ -128,12 +129,8 @@ def check_gravity(norm: float) -> None:
     """Raises CalibrationError for a specific force at rest of `norm` m/s2 that cannot be gravity."""
     if abs(norm - GRAVITY) < GRAVITY_SHARE * GRAVITY:
         return
-    if abs(norm - 1.0) < GRAVITY_SHARE:
-        what = "these are g; m/s2 are needed"
-    elif abs(norm - 1000.0) < 1000.0 * GRAVITY_SHARE:
-        what = "these are mg; m/s2 are needed"
-    else:
-        what = "the unit or the scale is wrong, or it was in free fall"
+    named = (text for reads, text in UNITS if abs(norm - reads) < GRAVITY_SHARE * reads)
+    what = next(named, "the unit or the scale is wrong, or it was in free fall")
     raise CalibrationError(f"gravity reads {norm:.4g} instead of {GRAVITY:.2f} m/s2: {what}")
 
 

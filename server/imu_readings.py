@@ -16,11 +16,11 @@ from tqdm import tqdm
 from fusion.measurements import Array
 from imu.calibration import CalibrationError
 from imu.clock import DeviceClock
-from imu.protocols.detection import ProtocolName, open_parser
+from imu.protocols.detection import Detector, ProtocolName, open_parser
 from imu.uart import SerialImu
 
-# s without a sample after which a port is given up.
-SILENCE = 5.0
+# s after which a port is given up: without a word, and without a sample in what comes, which may take all speeds to try.
+SILENCE, PUZZLED = 5.0, 15.0
 # bytes of a file that are read at once
 CHUNK = 1 << 20
 
@@ -74,8 +74,11 @@ def file_readings(args: argparse.Namespace) -> Array:
         while data := file.read(CHUNK):
             parts.append(np.array(parser.feed(data), dtype=np.float64).reshape(-1, 7))
             bar.update(len(data))
-    # a last line without an end
-    parts.append(np.array(parser.feed(b"\n"), dtype=np.float64).reshape(-1, 7))
+    if parser.protocol in ("", "json", "csv", "vectornav"):
+        # a last line without an end
+        parts.append(np.array(parser.feed(b"\n"), dtype=np.float64).reshape(-1, 7))
+    if isinstance(parser, Detector):
+        parts.append(np.array(parser.settle(), dtype=np.float64).reshape(-1, 7))
     samples = np.concatenate(parts)
     if not len(samples):
         raise CalibrationError(f"{path}: no IMU sample in it: {parser.last_error or 'too little to tell what it is'}")
@@ -107,9 +110,10 @@ def _port_readings(args: argparse.Namespace, notice: str) -> Iterator[Array]:
                     notice = ""
                 heard = arrival
                 yield clock.stamp(samples, arrival)
-            elif arrival - heard > SILENCE:
-                raise OSError(
-                    f"{args.source}: no IMU sample in {SILENCE:.0f} s: {parser.last_error or 'wrong protocol?'}"
-                )
+            elif arrival - heard > PUZZLED:
+                reason = parser.last_error or "wrong protocol?"
+                raise OSError(f"{args.source}: no IMU sample in {PUZZLED:.0f} s: {reason}")
+            if isinstance(parser, Detector) and parser.baud != port.baud:
+                port.set_baud(parser.baud)
     finally:
         port.close()

@@ -67,7 +67,7 @@ def test_an_imu_upside_down() -> None:
         ([still(6.0), still(6.0, force=np.array([0.5, 0.0, GRAVITY]))], "still for 6 s at most"),
         ([still(6.0), still(6.0, (0.02, 0.0, 0.0))], "still for 6 s at most"),
         ([still(12.0, force=np.array([0.0, 0.0, 1.0]))], "gravity reads 1 instead of 9.81 m/s2: these are g"),
-        ([still(12.0, force=np.array([0.0, 1000.0, 0.0]))], "these are mg"),
+        ([still(12.0, force=np.array([0.0, 1000.0, 0.0]))], "these are thousandths of g"),
         ([still(12.0, force=np.array([0.0, 0.0, 5.0]))], "the unit or the scale is wrong"),
     ],
 )
