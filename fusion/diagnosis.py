@@ -336,8 +336,8 @@ def _of_learned(seen: Seen, known: set[str]) -> Iterator[Diagnosis]:
     accel, gyro, position, attitude = np.median([scale for _, scale in looks], axis=0).tolist()
     # What an innovation is made of: where the prediction has next to no part in it, it says nothing of the IMU, and
     # what is learned of that wanders; and the same of fixes.
-    of_fix = np.array([np.diag(fix.pose.covariance) for fix in judged]).reshape(-1, 2, 3).sum(axis=2)
-    of_all = np.array([fix.outcome.innovation_sigma**2 for fix in judged]).reshape(-1, 2, 3).sum(axis=2)
+    of_fix = np.array([fix.pose.covariance for fix in judged]).diagonal(axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2)
+    of_all = (np.array([fix.outcome.innovation_sigma for fix in judged]) ** 2).reshape(-1, 2, 3).sum(axis=2)
     parts = np.median(of_fix / of_all, axis=0).tolist()
     noise = any("noise" in code for code in known)
     for block, times, part in zip(("position", "attitude"), (position, attitude), parts, strict=True):
@@ -361,7 +361,7 @@ def _residuals(t: Array, fixes: Sequence[JudgedFix]) -> Array:
     quaternions = np.array([fix.pose.quaternion_wxyz for fix in fixes])
     turned = -_rotation(quaternions * [1.0, -1.0, -1.0, -1.0], quaternions[:1] * [1.0, -1.0, -1.0, -1.0])
     poses = np.column_stack([[fix.pose.position for fix in fixes], turned])
-    sigma = np.sqrt([np.diag(fix.pose.covariance) for fix in fixes])
+    sigma = np.sqrt(np.array([fix.pose.covariance for fix in fixes]).diagonal(axis1=1, axis2=2))
     line = np.column_stack([np.ones_like(t), t - t.mean()])
     hat = line @ np.linalg.pinv(line)
     free: Array = 1.0 - np.diag(hat)
@@ -534,13 +534,13 @@ def _innovations(seen: Seen) -> Innovations | None:
     used = (marker >= 0) & (camera >= 0) & (np.arange(len(fixes)) >= 5)
     if np.sum(used) < PLACE_FIXES:
         return None
-    of_fix = np.array([np.diag(fix.pose.covariance) for fix in fixes])
+    of_fix = np.array([fix.pose.covariance for fix in fixes]).diagonal(axis1=1, axis2=2).copy()
     looks, scales = np.array([t for t, _ in seen.learned]), np.array([scale for _, scale in seen.learned])
     arrivals = [fix.outcome.arrival for fix in fixes]
     for i, block in enumerate((slice(0, 3), slice(3, 6)), start=2):  # as large as the filter took them for
         of_fix[:, block] *= np.maximum(1.0, np.interp(arrivals, looks, scales[:, i]))[:, np.newaxis] ** 2
     value = np.array([fix.outcome.innovation for fix in fixes])
-    variance = np.array([fix.outcome.innovation_sigma**2 for fix in fixes])
+    variance = np.array([fix.outcome.innovation_sigma for fix in fixes]) ** 2
     return Innovations(fixes, markers, marker, cameras, camera, used, value, variance, of_fix)
 
 
@@ -592,7 +592,8 @@ def _of_places(seen: Seen, axes: int) -> tuple[list[Diagnosis], bool]:
             text = f"fixes of camera {camera} disagree with those of camera {of.cameras[0]} by {1e3 * size:.0f} mm"
             evidence = {"source": f"{of.cameras[0]}, {camera}", "mm": (1e3 * by).tolist(), "sigmas": sigmas}
             said.append(Diagnosis("cameras_disagree", "warning", text, evidence))
-    said += _of_headings(of)
+    if len(of.markers) > 1:
+        said += _of_headings(of)
     return said, likely or bool(said)
 
 
@@ -631,25 +632,25 @@ def _response(fixes: Sequence[JudgedFix], effect: Array, total: Array, of_fix: A
     What an update does is known from the variances (n,) of the innovation and of the fix; how the speed follows, from
     a filter of place and speed alone with `accel_noise`, a density, whose variance of the place is made what is known.
     """
-    of_state = np.maximum(total - of_fix, 0.02 * total)
     steps = np.diff([fix.outcome.t for fix in fixes], prepend=fixes[0].outcome.t).tolist()
+    of_state = np.maximum(total - of_fix, 0.02 * total).tolist()
+    q = accel_noise**2
     moved, speed = effect[0].copy(), np.zeros_like(effect[0])
     response = np.zeros_like(effect)
     p, c, v = of_state[0], 0.0, 0.0  # the covariance: of the place, of both, of the speed
-    for i, (fix, dt) in enumerate(zip(fixes, steps, strict=True)):
+    for i, (fix, dt, known, of) in enumerate(zip(fixes, steps, of_state, of_fix.tolist(), strict=True)):
+        p, c, v = p + dt * (2.0 * c + dt * (v + q * dt / 3.0)), c + dt * (v + q * dt / 2.0), v + q * dt
+        p, c, v = known, c * known / p, v * known / p
         moved = moved + dt * speed
-        p, c, v = p + dt * (2.0 * c + dt * v) + accel_noise**2 * dt**3 / 3.0, c + dt * v, v
-        c, v = c + accel_noise**2 * dt**2 / 2.0, v + accel_noise**2 * dt
-        p, c, v = (x * of_state[i] / p for x in (p, c, v))
         response[i] = effect[i] - moved
         outcome = fix.outcome.outcome
         if outcome in BELIEVED:
-            gain, of_speed = p / (p + of_fix[i]), c / (p + of_fix[i])
+            gain, of_speed = p / (p + of), c / (p + of)
             moved, speed = moved + gain * response[i], speed + of_speed * response[i]
             p, c, v = (1.0 - gain) * p, (1.0 - gain) * c, v - of_speed * c
         elif outcome is not Outcome.REJECTED:
             moved, speed = effect[i].copy(), np.zeros_like(speed)
-            p, c, v = of_fix[i], 0.0, 1.0
+            p, c, v = of, 0.0, 1.0
     return response
 
 
