@@ -46,7 +46,8 @@ class CalibrationPage:
         self._changed = asyncio.Condition()
         self._state = b""
         self._picture = b""
-        self._count = 0
+        # Of the states and the pictures so far
+        self._count = self._pictures = 0
         self._ending = False
         self._viewers: set[asyncio.Task[Any]] = set()
         self._server: Server | None = None
@@ -82,18 +83,20 @@ class CalibrationPage:
         return bool(self._viewers)
 
     async def show(self, state: dict[str, Any], picture: bytes) -> None:
-        """`state` as the script of the page reads it, `picture` a JPEG, b"" for the one before."""
+        """`state` as the script of the page reads it, `picture` a JPEG that belongs to it, b"" for none."""
         async with self._changed:
             self._state = msgspec.json.encode(state)
-            self._picture = picture or self._picture
             self._count += 1
+            if picture:
+                self._picture = picture
+                self._pictures += 1
             self._changed.notify_all()
 
     async def _serve(self, connection: ServerConnection) -> None:
         task = asyncio.current_task()
         assert task is not None
         self._viewers.add(task)
-        shown = 0
+        shown = seen = 0
         try:
             with contextlib.suppress(ConnectionClosed):
                 while True:
@@ -102,7 +105,8 @@ class CalibrationPage:
                             await self._changed.wait()
                         if self._count == shown:
                             return
-                        shown, state, picture = self._count, self._state, self._picture
+                        shown, state = self._count, self._state
+                        picture, seen = (b"" if seen == self._pictures else self._picture), self._pictures
                     await connection.send(state, text=True)
                     if picture:
                         await connection.send(picture)

@@ -6,6 +6,8 @@ const context = canvas.getContext("2d");
 
 let state = null;
 let picture = null;
+// The state that the picture came with: pictures are fewer than states.
+let drawn = null;
 // A view that was taken is shown for a moment, in ms.
 const FLASH = 700;
 let flashUntil = 0;
@@ -19,7 +21,9 @@ function connect() {
     if (typeof data === "string") {
       show(JSON.parse(data));
     } else {
+      const belonging = state;
       picture = await createImageBitmap(data);
+      drawn = belonging;
       draw();
     }
   };
@@ -38,7 +42,6 @@ function show(next) {
   document.getElementById("board").textContent = next.board;
   document.getElementById("views").textContent = next.views;
   what.className = next.state;
-  if (performance.now() < flashUntil && next.state === "") what.className = "kept";
   what.textContent = next.text;
   criteria.replaceChildren(...next.criteria.map(criterion));
   draw();
@@ -55,26 +58,26 @@ function criterion({ met, part, text }) {
 }
 
 function draw() {
-  if (!picture || !state) return;
+  if (!picture) return;
   if (canvas.width !== picture.width || canvas.height !== picture.height) {
     canvas.width = picture.width;
     canvas.height = picture.height;
   }
   const { width, height } = canvas;
   context.drawImage(picture, 0, 0);
-  const cells = state.cells.length;
+  const cells = drawn.cells.length;
   context.lineWidth = 1;
   context.strokeStyle = "rgb(255 255 255 / 35%)";
-  context.fillStyle = "rgb(40 190 100 / 30%)";
-  state.cells.forEach((row, y) =>
+  context.fillStyle = "rgb(40 190 100 / 20%)";
+  drawn.cells.forEach((row, y) =>
     row.forEach((seen, x) => {
       const box = [(x * width) / cells, (y * height) / cells, width / cells, height / cells];
       if (seen) context.fillRect(...box);
       context.strokeRect(...box);
     }),
   );
-  outline(state.target, "#f59e0b", [14, 9]);
-  outline(state.outline, "#3b82f6", []);
+  outline(drawn.target, "#f59e0b", [14, 9]);
+  outline(drawn.outline, "#3b82f6", []);
   if (performance.now() < flashUntil) {
     context.lineWidth = 16;
     context.strokeStyle = "rgb(40 190 100)";
