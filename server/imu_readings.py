@@ -19,7 +19,7 @@ from imu.clock import DeviceClock
 from imu.protocols.detection import Detector, ProtocolName, open_parser
 from imu.uart import SerialImu
 
-# s after which a port is given up: without a word, and without a sample in what comes, which may take all speeds to try.
+# s after which a port is given up: without a word; without a sample in what comes, since that may be at another speed.
 SILENCE, PUZZLED = 5.0, 15.0
 # bytes of a file that are read at once
 CHUNK = 1 << 20
