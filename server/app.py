@@ -98,6 +98,7 @@ _PAGE = {
     "/dashboard.js": ("dashboard.js", "text/javascript; charset=utf-8"),
     "/favicon.svg": ("favicon.svg", "image/svg+xml"),
     "/phone": ("phone.html", "text/html; charset=utf-8"),
+    "/phone.css": ("phone.css", "text/css; charset=utf-8"),
     "/phone.js": ("phone.js", "text/javascript; charset=utf-8"),
 }
 _WEBSOCKETS = ("/", "/v1/poses", "/v1/robot", "/v1/camera")

@@ -6,13 +6,17 @@ import asyncio
 import contextlib
 import json
 import math
+import shutil
+import subprocess
 import time
 import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
 from camera.calibration import Intrinsics
@@ -89,6 +93,17 @@ async def heard(connection: ClientConnection, kind: str = "") -> dict[str, Any]:
 async def hello(connection: ClientConnection, robot: str = "rover", pose_rate_hz: float = 0.0) -> dict[str, Any]:
     await connection.send(json.dumps({"type": "hello", "robot": robot, "pose_rate_hz": pose_rate_hz}))
     return await heard(connection)
+
+
+def make_certificate(folder: Path) -> tuple[str, str]:
+    """As the README makes one, for this machine."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl, which makes the certificate, is not installed")
+    certificate, key = str(folder / "certificate.pem"), str(folder / "key.pem")
+    command = "openssl req -x509 -newkey rsa:2048 -nodes -days 800 -subj /CN=Steadfix"
+    command += " -addext subjectAltName=IP:127.0.0.1,DNS:localhost -addext extendedKeyUsage=serverAuth"
+    subprocess.run([*command.split(), "-keyout", key, "-out", certificate], check=True, capture_output=True, timeout=60)
+    return certificate, key
 
 
 def imu(device_time: float, n: int = 10) -> str:

@@ -20,7 +20,7 @@ from server.access import CertificateError, is_local, is_loopback, origin_allowe
 from server.app import Service
 from server.config import ConfigError, parse
 from server.robot_client import AddressError, RefusedError, Robot
-from tests.server.room import CONFIG, client, fix, heard, hello, imu, run, serving, until
+from tests.server.room import CONFIG, client, fix, heard, hello, imu, make_certificate, run, serving, until
 
 TOKENS = CONFIG.replace("[server]", '[server]\ntoken = "look"').replace(
     'name = "rover"', 'name = "rover"\ntoken = "sha256:' + hashlib.sha256(b"drive").hexdigest() + '"'
@@ -37,15 +37,6 @@ def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     return make_certificate(tmp_path_factory.mktemp("tls"))
-
-
-def make_certificate(folder: Path) -> tuple[str, str]:
-    """As the README makes one, for this machine."""
-    certificate, key = str(folder / "certificate.pem"), str(folder / "key.pem")
-    command = "openssl req -x509 -newkey rsa:2048 -nodes -days 800 -subj /CN=Steadfix"
-    command += " -addext subjectAltName=IP:127.0.0.1,DNS:localhost -addext extendedKeyUsage=serverAuth"
-    subprocess.run([*command.split(), "-keyout", key, "-out", certificate], check=True, capture_output=True, timeout=60)
-    return certificate, key
 
 
 def elsewhere(service: Service, path: str, **headers: str) -> connect:
