@@ -16,7 +16,7 @@ import numpy as np
 
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
-from camera.exposure import Delivery, DeliveryMeter, advice, black
+from camera.exposure import Delivery, DeliveryMeter, advice, black, blur_px
 from camera.fix import Body, MarkerMount, marker_poses, predict, rays, solve
 from camera.floor import Anchor, Placement, PlacementError, averaged, load_placement, locate_camera
 from camera.markers import MarkerSighting
@@ -363,11 +363,18 @@ class Camera:
         if delivery is None:
             return {}
         return advice(
-            delivery,
-            focal_px=float(self.intrinsics.camera_matrix[0, 0]),
-            distance=None if self.placement is None else float(self.placement.world_from_camera[2, 3]),
-            asked_rate_hz=self.config.frame_rate_hz,
+            delivery, focal_px=self._focal_px, distance=self._height, asked_rate_hz=self.config.frame_rate_hz
         )
+
+    @property
+    def _focal_px(self) -> float:
+        return float(self.intrinsics.camera_matrix[0, 0])
+
+    @property
+    def _height(self) -> float | None:
+        """m above the floor, None while that is not known."""
+        height = 0.0 if self.placement is None else float(self.placement.world_from_camera[2, 3])
+        return height if height > 0.0 else None
 
     def news(self, now: float) -> list[str]:
         """What there is to say of its picture that has not been said yet, for the log."""
@@ -384,6 +391,9 @@ class Camera:
     def health(self, now: float) -> dict[str, Any]:
         placement = self.placement
         delivery = self.delivery(now)
+        exposure = math.nan if delivery is None else delivery.exposure
+        height = self._height
+        blur = math.nan if height is None else blur_px(exposure, self._focal_px, height)
         return {
             "status": self.status or (black(delivery) if delivery is not None else "") or "ok",
             "advice": list(self.advice(now).values()),
@@ -391,6 +401,8 @@ class Camera:
             "frame_age": round(now - self.last_frame, 3) if math.isfinite(self.last_frame) else None,
             "frames": self.frames,
             "detect_ms": round(self.detect_ms, 1) if math.isfinite(self.detect_ms) else None,
+            "exposure_ms": round(1e3 * exposure, 3) if math.isfinite(exposure) else None,
+            "blur_px_at_1_m_s": round(blur, 1) if math.isfinite(blur) else None,
             "markers": list(self.markers),
             "located": placement is not None,
             "location": self.unlocated or "ok",

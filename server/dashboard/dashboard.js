@@ -118,13 +118,19 @@ function showState() {
   element("state").className = kind;
   setText(element("state-text"), text);
   element("lost").hidden = connected || !health;
-  const trouble = element("trouble");
-  trouble.hidden = !connected || reasons.length === 0;
-  const list = trouble.querySelector("ul");
-  if (list.dataset.shown !== reasons.join("\n")) {
-    list.dataset.shown = reasons.join("\n");
-    list.replaceChildren(...reasons.map((reason) => Object.assign(document.createElement("li"), { textContent: reason })));
-  }
+  showList("trouble", connected ? reasons : []);
+  const advice = Object.entries(health?.cameras ?? {}).flatMap(([name, camera]) =>
+    camera.advice.map((text) => `camera ${name}: ${text}`),
+  );
+  showList("advice", connected ? advice : []);
+}
+
+function showList(section, texts) {
+  element(section).hidden = texts.length === 0;
+  const list = element(section).querySelector("ul");
+  if (list.dataset.shown === texts.join("\n")) return;
+  list.dataset.shown = texts.join("\n");
+  list.replaceChildren(...texts.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
 }
 
 // Nothing is touched that stays the same: a selection survives, and the layout rests.

@@ -166,7 +166,7 @@ class Ceiling:
         if self._sequence > self._left:
             raise OSError("camera 0: it was unplugged")
         time.sleep(0.05)  # the pace of this camera
-        return Frame(time.monotonic() - 0.02, self._image, self._sequence)
+        return Frame(time.monotonic() - 0.02, self._image, self._sequence, exposure=0.02)
 
     def close(self) -> None:
         pass

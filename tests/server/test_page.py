@@ -98,6 +98,8 @@ def test_robots_are_drawn_and_listed(tmp_path: Path) -> None:
             assert float(sigma) > 0.0
             await see(page, "document.querySelector('#cameras td + td')?.innerText === '3 markers'")
             assert "robot cart: no IMU has connected yet" in await page.inner_text("#trouble")
+            await see(page, "!document.getElementById('advice').hidden")
+            assert "camera ceiling: 4.0 px of blur at 1 m/s: halve the exposure" in await page.inner_text("#advice")
             # Its trail, ellipse and arrow are on the map, in its colour.
             coloured = await page.evaluate(COLOURED)
             assert coloured > 50
