@@ -84,7 +84,8 @@ class BodyReadings:
     With lever arm l, the specific force at the origin is f - α × l - ω × (ω × l). α is the difference of two rates over
     their distance. It is noisy, but its integral is not: in the velocity it leaves no more than the noise of one rate
     times l, and nothing that grows. (The other way, to let the filter carry the IMU's place and to move its poses,
-    needs no α; but then it is the IMU that must never slide sideways, which off the axle it does.)
+    needs no α; but then it is the IMU that must never slide sideways, which off the axle it does: in
+    `benchmarks.imu lever-arms` that is worse than to say nothing of the lever arm.)
 
     One sample's answer depends on the samples before it, not on how they are cut into batches.
     """
