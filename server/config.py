@@ -6,12 +6,13 @@ ConfigError whose text names the file, the line where it can be found, the key, 
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_type_hints
 
@@ -210,6 +211,23 @@ def parse(text: str, name: str = "configuration", folder: Path = Path()) -> Conf
         server = msgspec.structs.replace(server, certificate=certificate, key=key)
     cameras = tuple(_with_absolute_paths(camera, folder) for camera in config.camera)
     return msgspec.structs.replace(config, server=server, camera=cameras)
+
+
+def with_settings(params: FilterParams, settings: Iterable[str]) -> FilterParams:
+    """A filter's parameters with some given as on a command line, `gyro_noise=0.002`. Raises ConfigError."""
+    for setting in settings:
+        name, _, text = (part.strip() for part in setting.partition("="))
+        if name not in FilterParams.__struct_fields__:
+            nearest = difflib.get_close_matches(name, FilterParams.__struct_fields__, n=1)
+            advice = f"did you mean {nearest[0]}?" if nearest else "fusion/params.py lists them"
+            raise ConfigError(f"--set {setting}: the filter has no parameter {name!r}; {advice}")
+        changed = None
+        with contextlib.suppress(msgspec.ValidationError):
+            changed = msgspec.convert(msgspec.structs.asdict(params) | {name: text}, FilterParams, strict=False)
+        if changed is None or not math.isfinite(getattr(changed, name)):
+            raise ConfigError(f"--set {setting}: found {text or 'nothing'}; needed: {_range(name)}")
+        params = changed
+    return params
 
 
 def _with_absolute_paths(camera: CameraConfig, folder: Path) -> CameraConfig:

@@ -35,6 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="POSES", help="write a pose per IMU sample, in TUM format")
     parser.add_argument("--config", type=Path, metavar="FILE", help="motion model, noise and IMU mounting from here")
     parser.add_argument("--robot", metavar="NAME", help="which robot of the configuration it is")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a parameter of the filter, such as gyro_noise=0.002, as in [robot.filter]; may be given several times",
+    )
     parser.add_argument("--engine", choices=get_args(Engine), help="default: the robot's, else numba")
     parser.add_argument("--motion", choices=get_args(Motion), help="default: the robot's, else ground")
     parser.add_argument(
@@ -195,7 +202,7 @@ def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion
             )
         robot = robots[wanted]
         params, motion, engine, imu = robot.filter, robot.motion, robot.engine, robot.imu
-    return params, args.motion or motion, args.engine or engine, imu
+    return config.with_settings(params, args.set), args.motion or motion, args.engine or engine, imu
 
 
 def _compile() -> None:

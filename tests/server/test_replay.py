@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import threading
@@ -249,6 +250,111 @@ def test_the_motion_of_the_configuration(tmp_path, capsys):
     error = capsys.readouterr().err
     assert "rober" in error
     assert "drive, rover" in error
+
+
+def test_parameters_of_the_filter_on_the_command_line(tmp_path, capsys):
+    folder = plain(tmp_path / "drive")
+    config = tmp_path / "room.toml"
+    config.write_text(
+        '[[robot]]\nname = "drive"\n[robot.filter]\ntime_offset_sigma = 0\ngate_inflation = 1\n'
+        "[[robot.marker]]\nid = 7\nsize_mm = 60\n"
+    )
+
+    def accepted(*options):
+        assert main(["replay", str(folder), "--json", *options]) == 0
+        figures = json.loads(capsys.readouterr().out)
+        return figures["fixes_accepted"], figures["time_offset_sigma_ms"]
+
+    assert accepted()[0] == 5
+    # Nothing but the first fix is believed.
+    gates = ("--set", "gate=1e-9", "--set", "gate_block = 1e-9", "--set", "reinit_count=9")
+    assert accepted(*gates, "--set", "gate_inflation=1", "--set", "time_offset_sigma=0") == (1, 0.0)
+    # On top of a configuration.
+    assert accepted("--config", str(config), *gates) == (1, 0.0)
+    assert accepted("--config", str(config), *gates, "--set", "time_offset_sigma=0.05")[1] == pytest.approx(50.0)
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("gyro_nois=0.1", "no parameter 'gyro_nois'; did you mean gyro_noise?"),
+        ("xyz=0.1", "no parameter 'xyz'; fusion/params.py lists them"),
+        ("", "no parameter ''"),
+        ("gyro_noise", "found nothing; needed: a number above 0"),
+        ("gyro_noise=-1", "found -1; needed: a number above 0"),
+        ("gyro_noise=loud", "found loud; needed: a number above 0"),
+        ("gyro_noise=nan", "found nan; needed: a number above 0"),
+        ("gyro_noise=inf", "found inf; needed: a number above 0"),
+        ("reinit_count=2.5", "found 2.5; needed: a whole number at least 2"),
+    ],
+)
+def test_parameters_that_cannot_be(tmp_path, capsys, setting, says):
+    assert main(["replay", str(plain(tmp_path / "drive")), "--set", setting]) != 0
+    error = capsys.readouterr().err
+    assert error.startswith(f"steadfix: --set {setting}: ")
+    assert says in error
+
+
+def write(folder, simulation):
+    """A simulation as a recording."""
+    folder.mkdir()
+    recorder = Recorder(folder.parent, [folder.name])
+    for sample in simulation.samples:
+        recorder.imu(ImuBatch(folder.name, float(sample[0]), sample[np.newaxis]))
+    for fix in simulation.fixes:
+        recorder.fix(replace(fix, robot=folder.name))
+    for row in simulation.truth[::10]:
+        recorder.truth(folder.name, float(row[0]), row[1:4], row[4:])
+    recorder.close()
+    return folder
+
+
+@pytest.mark.parametrize("channel", ["best", "smooth"])
+def test_the_object_carries_what_the_filter_has_found_out(tmp_path, capsys, channel):
+    camera = CameraParams(stamp_error=0.05, rate=4.0, dropout=0.2)
+    simulation = simulate(random_ground(4), 4, 60.0, camera=camera, tilt=(0.02, 0.0))
+    # At 45 s the robot is carried by two metres.
+    fixes = [
+        replace(fix, hypotheses=tuple(replace(h, position=h.position + [2.0, 0.0, 0.0]) for h in fix.hypotheses))
+        if fix.t > 45.0
+        else fix
+        for fix in simulation.fixes
+    ]
+    # One is a second older than the buffer, one comes twice.
+    fixes.append(replace(fixes[100], t=fixes[100].t - 3.0))
+    fixes.append(replace(fixes[50], arrival=fixes[50].arrival))
+    fixes.sort(key=lambda fix: fix.arrival)
+    folder = write(tmp_path / "rover", replace(simulation, fixes=fixes))
+    assert main(["replay", str(folder), "--json", "--channel", channel]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["time_offset_ms"] == pytest.approx(-50.0, abs=4.0 * figures["time_offset_sigma_ms"])
+    for i, true in enumerate((math.degrees(0.02), 0.0)):
+        assert figures["tilt_deg"][i] == pytest.approx(true, abs=4.0 * figures["tilt_sigma_deg"][i] + 0.01)
+    for name in ("gyro", "accel"):
+        bias, sigma = np.array(figures[f"{name}_bias"]), np.array(figures[f"{name}_bias_sigma"])
+        true = getattr(simulation, f"{name}_bias")[-1]
+        assert bias.shape == sigma.shape == (3,)
+        # A part of the accelerometer's sideways bias is tilt.
+        assert (np.abs(bias - true) < 4.0 * sigma + 0.02).all()
+    nis = figures["nis"]
+    assert all(0.0 < nis[block]["low"] < 1.0 < nis[block]["high"] for block in ("pose", "position", "attitude"))
+    assert nis["pose"]["fixes"] == 60
+    outcomes = figures["outcomes"]
+    assert sum(outcomes.values()) == figures["fixes"] == len(fixes)
+    assert (outcomes["initialised"], outcomes["too_late"], outcomes["duplicate"]) == (1, 1, 1)
+    assert outcomes["reinitialised"] == figures["resets"] == 1
+    assert outcomes["rejected"] >= 2
+    accuracy = figures["accuracy"]
+    assert accuracy["channel"] == channel
+    assert accuracy["mm_p50"] < 40.0
+    assert accuracy["deg_p50"] < 2.0
+    # The poses before the reset were wrong by two metres, and that counts.
+    assert accuracy["fixes"] == sum(bucket["fixes"] for bucket in accuracy["by_fix_age"])
+    assert max(bucket["mm_p95"] or 0.0 for bucket in accuracy["by_fix_age"]) > 100.0
+    (diagnosis,) = [diagnosis for diagnosis in figures["diagnoses"] if diagnosis["code"] == "stamps"]
+    assert diagnosis["evidence"]["late_ms"] == pytest.approx(50.0, abs=8.0)
+    assert figures["rmse_mm"] > 100.0
+    assert figures["hold_last_mm"] > 100.0
 
 
 ROW = ",".join(map(str, circle.imu(np.array([0.0]))[0].tolist()))
