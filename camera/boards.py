@@ -186,8 +186,9 @@ class BoardDetector:
             )
         small, _ = _shrunk(picture)
         found, _, grid = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
-        size = sorted(grid.shape[:2], reverse=True) if found else []
-        if size and size != sorted((self.board.columns, self.board.rows), reverse=True):
+        size = sorted(grid.shape[:2], reverse=True) if found else [0]
+        # 3 x 3 are found in noise as well.
+        if size[-1] > 3 and size != sorted((self.board.columns, self.board.rows), reverse=True):
             right = Board("chessboard", size[0], size[1], self.board.square)
             return f"it shows {size[0]} x {size[1]} inner corners; is it --board {right}?"
         return "no chessboard is seen"
