@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +17,10 @@ from camera.markers import grey
 BLUR_LIMIT_PX = 3.0
 # m/s: the speed that blur is told for.
 SPEED = 1.0
+# Edges of markers at rest that are wider than this sigma are out of focus, or the lens is dirty. px
+FOCUS_LIMIT_PX = 1.5
+# s of sightings that the measured blur is of, and how many there must be.
+BLUR_WINDOW, BLUR_COUNT = 10.0, 20
 # Grey levels, of 255: white paper below the first cannot be told from nothing, below the second it drowns in noise.
 BLACK, DARK = 10.0, 60.0
 # A pixel of this grey level is saturated; above this share of them white paper glares, and its edges move.
@@ -78,6 +84,36 @@ def _light(frame: Frame) -> tuple[float, float]:
     return float(np.percentile(sample, 99.0)), float(np.mean(sample >= SATURATED))
 
 
+class EdgeBlur:
+    """How wide the edges of markers are in the picture: of those at rest by the lens, of the others by motion too."""
+
+    def __init__(self) -> None:
+        self._still: deque[tuple[float, float]] = deque()
+        self._others: deque[tuple[float, float]] = deque()
+
+    def add(self, t: float, still: Iterable[float], others: Iterable[float]) -> None:
+        """Sigmas of the edges in a frame, px: of markers that never move, and of those that may."""
+        for kept, new in ((self._still, still), (self._others, others)):
+            kept.extend((t, sigma) for sigma in new if math.isfinite(sigma))
+            while kept and kept[0][0] < t - BLUR_WINDOW:
+                kept.popleft()
+
+    def still_px(self) -> float:
+        """Sigma of the edges of markers at rest, px; nan until enough were seen."""
+        sigmas = [sigma for _, sigma in list(self._still)]
+        return statistics.median(sigmas) if len(sigmas) >= BLUR_COUNT else math.nan
+
+    def motion_px(self) -> float:
+        """By how far the quickest tenth of the others is smeared, px, which is rather too little; nan until known.
+
+        Smearing evenly over b px adds b^2 / 12 to an edge's variance.
+        """
+        sigmas = sorted(sigma for _, sigma in list(self._others))
+        if len(sigmas) < BLUR_COUNT or not (still := self.still_px()) > 0.0:
+            return math.nan
+        return math.sqrt(12.0 * max(0.0, sigmas[-1 - len(sigmas) // 10] ** 2 - still**2))
+
+
 def blur_px(exposure: float, focal_px: float, distance: float, speed: float = SPEED) -> float:
     """Motion blur, px, of what moves at `speed` (m/s) across the view at `distance` (m); `exposure` in s.
 
@@ -94,14 +130,26 @@ def black(delivery: Delivery) -> str:
 
 
 def advice(
-    delivery: Delivery, *, focal_px: float, distance: float | None, asked_rate_hz: float = 0.0
+    delivery: Delivery,
+    edges: EdgeBlur,
+    *,
+    focal_px: float,
+    distance: float | None,
+    asked_rate_hz: float = 0.0,
 ) -> dict[str, str]:
-    """What is to be improved, a sentence each, by what it is about: blur, light, rate, load.
+    """What is to be improved, a sentence each, by what it is about: focus, blur, light, rate, load.
 
     `focal_px`: the camera's focal length. `distance`: m from it to the robots, None while that is not known.
     `asked_rate_hz`: 0 where nothing was asked for.
     """
     texts = {}
+    if (still := edges.still_px()) > FOCUS_LIMIT_PX:
+        texts["focus"] = f"edges at rest are {still:.1f} px wide (sigma): is the lens out of focus, or dirty?"
+    if math.isnan(delivery.exposure) and (motion := edges.motion_px()) > BLUR_LIMIT_PX:
+        texts["blur"] = (
+            f"robots that move are smeared by {motion:.1f} px: fix a shorter exposure, with exposure_ms or, where "
+            "that is not taken, in the camera's own settings"
+        )
     if distance is not None and delivery.exposure > 0.0:
         blur = blur_px(delivery.exposure, focal_px, distance)
         if blur > BLUR_LIMIT_PX:

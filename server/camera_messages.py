@@ -49,6 +49,14 @@ class CameraWelcome(Struct, frozen=True, tag_field="type", tag="welcome"):
     line_time: float
 
 
+class MarkerSizes(Struct, frozen=True, tag_field="type", tag="sizes"):
+    """How long the sides of the smallest and the largest marker appear in the picture, px, now that the service knows
+    where the camera is; null for as large as can be."""
+
+    shortest_px: float
+    longest_px: float | None
+
+
 class MarkerSeen(Struct, frozen=True):
     """`t`: s of the node's clock, mid-exposure of the marker's rows. The rest as in `MarkerSighting`."""
 
@@ -56,6 +64,7 @@ class MarkerSeen(Struct, frozen=True):
     t: _Time
     corners_px: tuple[_Corner, _Corner, _Corner, _Corner]
     sigma_px: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    blur_px: Annotated[float, Meta(ge=0.0, le=1000.0)] | None = None
 
 
 class FrameSeen(Struct, frozen=True, tag_field="type", tag="frame"):
@@ -85,7 +94,7 @@ class NodeStatus(Struct, frozen=True, tag_field="type", tag="status"):
 
 
 FromNode = CameraHello | FrameSeen | NodeStatus | ClockAnswer
-ToNode = CameraWelcome | ClockQuestion | Error
+ToNode = CameraWelcome | MarkerSizes | ClockQuestion | Error
 
 encode = msgspec.json.Encoder().encode
 _from_node: msgspec.json.Decoder[FromNode] = msgspec.json.Decoder(FromNode)

@@ -26,7 +26,16 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import DeliveryMeter, black
 from camera.tracking import MarkerTracker
-from server.camera_messages import CameraHello, CameraWelcome, FrameSeen, MarkerSeen, NodeStatus, encode, to_node
+from server.camera_messages import (
+    CameraHello,
+    CameraWelcome,
+    FrameSeen,
+    MarkerSeen,
+    MarkerSizes,
+    NodeStatus,
+    encode,
+    to_node,
+)
 from server.messages import ClockAnswer, ClockQuestion, Error, MessageError
 from server.terminal import log_to_stderr, until_stopped
 
@@ -77,6 +86,10 @@ class Watch:
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
+    def sizes_px(self, shortest_px: float, longest_px: float) -> None:
+        """How long the markers' sides are, which makes searching for them cheaper."""
+        self._tracker.sides_px = shortest_px, longest_px
+
     def stop(self) -> None:
         """End the thread, and wait a moment for it to let go of the camera."""
         self._stop.set()
@@ -123,7 +136,7 @@ class Watch:
         if self.trouble:
             log.info("frames are coming, %d x %d px", frame.image.shape[1], frame.image.shape[0])
             self.trouble = ""
-        markers = [MarkerSeen(s.id, s.t, s.corners_px.tolist(), s.sigma_px) for s in sightings]
+        markers = [MarkerSeen(s.id, s.t, s.corners_px.tolist(), s.sigma_px, _known(s.blur_px)) for s in sightings]
         height_px, width_px = frame.image.shape[:2]
         detect_ms = 1e3 * (time.monotonic() - start)
         # When it is sent is to be seen.
@@ -330,9 +343,16 @@ class Node:
             match message:
                 case ClockQuestion(id=id):
                     await connection.send(encode(ClockAnswer(id, received, self._clock())), text=True)
+                case MarkerSizes(shortest_px, longest_px) if self._watch is not None:
+                    self._watch.sizes_px(shortest_px, math.inf if longest_px is None else longest_px)
                 case Error(reason=reason) if reason != said:
                     said = reason
                     log.warning("the service says: %s", reason)
+
+
+def _known(value: float) -> float | None:
+    """For JSON, which has no nan."""
+    return value if math.isfinite(value) else None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
-from camera.exposure import Delivery, DeliveryMeter, advice, black, blur_px
+from camera.exposure import Delivery, DeliveryMeter, EdgeBlur, advice, black, blur_px
 from camera.fix import Body, MarkerMount, marker_poses, predict, rays, solve
 from camera.floor import Anchor, Placement, PlacementError, averaged, load_placement, locate_camera
 from camera.markers import MarkerSighting
@@ -150,6 +150,7 @@ class Camera:
             raise ConfigError(f'camera "{config.name}": {error}') from None
         self._image_size = (0, 0)
         self._meter = DeliveryMeter()
+        self._edges = EdgeBlur()
         # What was told about the picture, and when it was last so.
         self._told: dict[str, float] = {}
         # Anchors as seen in the frames of the present look; whether one whole look has been had; whether the last one
@@ -244,6 +245,11 @@ class Camera:
         self.frames += 1
         self.last_frame = arrival
         self.markers = tuple(sorted(sighting.id for sighting in sightings))
+        self._edges.add(
+            arrival,
+            still=(sighting.blur_px for sighting in sightings if sighting.id in self.anchor_ids),
+            others=(sighting.blur_px for sighting in sightings if sighting.id not in self.anchor_ids),
+        )
         self._arrivals.append(arrival)
         while self._arrivals[0] < arrival - RATE_WINDOW:
             self._arrivals.popleft()
@@ -363,7 +369,11 @@ class Camera:
         if delivery is None:
             return {}
         return advice(
-            delivery, focal_px=self._focal_px, distance=self._height, asked_rate_hz=self.config.frame_rate_hz
+            delivery,
+            self._edges,
+            focal_px=self._focal_px,
+            distance=self._height,
+            asked_rate_hz=self.config.frame_rate_hz,
         )
 
     @property

@@ -22,7 +22,15 @@ from camera.calibration import CalibrationError
 from camera.exposure import Delivery
 from camera.markers import MarkerSighting
 from imu.clock import DeviceClock
-from server.camera_messages import CameraHello, CameraWelcome, FrameSeen, NodeStatus, encode, from_node
+from server.camera_messages import (
+    CameraHello,
+    CameraWelcome,
+    FrameSeen,
+    MarkerSizes,
+    NodeStatus,
+    encode,
+    from_node,
+)
 from server.cameras import Camera, Seen, SightedFrame
 from server.config import CameraConfig, Config
 from server.messages import ClockAnswer, ClockQuestion, MessageError
@@ -132,10 +140,10 @@ class RemoteCamera(Camera):
             line_time=config.line_time,
         )
         questions: dict[int, float] = {}
-        asking = None
+        tending = None
         try:
             await connection.send(encode(welcome), text=True)
-            asking = asyncio.create_task(self._ask_clock(connection, questions))
+            tending = asyncio.create_task(self._tend(connection, questions))
             async for data in connection:
                 arrival = self._heard = time.monotonic()
                 try:
@@ -143,8 +151,8 @@ class RemoteCamera(Camera):
                 except MessageError as error:
                     await refuse(error)
         finally:
-            if asking is not None:
-                asking.cancel()
+            if tending is not None:
+                tending.cancel()
             if self._connection is connection:
                 self._connection = None
             if self._connection is None and not self._stop.is_set():
@@ -156,7 +164,9 @@ class RemoteCamera(Camera):
             self.status = status
             log.info("camera %s: %s", self.config.name, status)
 
-    async def _ask_clock(self, connection: ServerConnection, questions: dict[int, float]) -> None:
+    async def _tend(self, connection: ServerConnection, questions: dict[int, float]) -> None:
+        """Ask for the node's clock, tell it what is found out about its camera, and miss it when it is silent."""
+        told = None
         for id in itertools.count():
             while len(questions) >= CLOCK_FAST_COUNT:
                 del questions[next(iter(questions))]
@@ -165,6 +175,11 @@ class RemoteCamera(Camera):
             if connection.transport.get_write_buffer_size() == 0:
                 questions[id] = now
                 broadcast([connection], encode(ClockQuestion(id, now)), text=True)
+            if self.frames and (placement := self.placement) is not None and placement is not told:
+                told = placement
+                shortest, longest = self._sides_px(placement)
+                sizes = MarkerSizes(shortest, longest if math.isfinite(longest) else None)
+                broadcast([connection], encode(sizes), text=True)
             if now - self._heard >= SILENCE and self._connection is connection:
                 self._say(f"its node ({self.node}) says nothing any more; waiting for it")
             await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
@@ -207,7 +222,12 @@ class RemoteCamera(Camera):
         to_host, offset = self.clock.to_host, self.config.time_offset
         sightings = [
             MarkerSighting(
-                to_host(marker.t) + offset, self.config.name, marker.id, np.array(marker.corners_px), marker.sigma_px
+                to_host(marker.t) + offset,
+                self.config.name,
+                marker.id,
+                np.array(marker.corners_px),
+                marker.sigma_px,
+                math.nan if marker.blur_px is None else marker.blur_px,
             )
             for marker in sorted(seen.markers, key=lambda marker: marker.id)
         ]

@@ -5,9 +5,10 @@ import pytest
 
 from camera.calibration import Intrinsics
 from camera.capture import Frame
-from camera.exposure import Delivery, DeliveryMeter, advice, black, blur_px
+from camera.exposure import BLUR_COUNT, BLUR_WINDOW, Delivery, DeliveryMeter, EdgeBlur, advice, black, blur_px
+from camera.markers import MarkerDetector
 from camera.synthetic import Room, straight_down
-from fusion.geometry import transform
+from fusion.geometry import rotation_about_z, transform
 
 GOOD = Delivery(rate_hz=30.0, used_hz=30.0, exposure=0.002, white=180.0, saturated=0.0)
 
@@ -16,8 +17,9 @@ def with_(**changes):
     return Delivery(**{name: getattr(GOOD, name) for name in Delivery.__slots__} | changes)
 
 
-def told(delivery, distance=3.0, focal_px=1140.0, asked_rate_hz=0.0):
-    return list(advice(delivery, focal_px=focal_px, distance=distance, asked_rate_hz=asked_rate_hz).values())
+def told(delivery, distance=3.0, focal_px=1140.0, asked_rate_hz=0.0, edges=None):
+    edges = edges or EdgeBlur()
+    return list(advice(delivery, edges, focal_px=focal_px, distance=distance, asked_rate_hz=asked_rate_hz).values())
 
 
 def test_the_blur_is_how_far_a_marker_moves_in_a_rendered_picture():
@@ -29,6 +31,55 @@ def test_the_blur_is_how_far_a_marker_moves_in_a_rendered_picture():
     start, end = (room.corners_px(0.1, transform(np.eye(3), [x, 0.2, 0.0])) for x in (0.1, 0.1 + 1.0 * 0.01))
     moved = np.linalg.norm(end - start, axis=1)
     assert blur_px(0.01, 900.0, 2.5) == pytest.approx(moved.mean(), rel=1e-6) == 3.6
+
+
+def seen_edges(lens_px, smear_px):
+    """The blur that the detector measures of a marker at rest and one that moves by `smear_px` while it is exposed."""
+    intrinsics = Intrinsics(
+        np.array([[900.0, 0.0, 319.5], [0.0, 900.0, 239.5], [0.0, 0.0, 1.0]]), np.zeros(5), 640, 480
+    )
+    room = Room(intrinsics, straight_down(0.0, 0.0, 3.0), "4X4_50", 1)
+    detector, edges = MarkerDetector("4X4_50", [7, 8]), EdgeBlur()
+    still, start = (transform(rotation_about_z(0.3), [x, 0.1, 0.0]) for x in (-0.5, 0.4))
+    for k in range(4):
+        end = start.copy()
+        end[:2, 3] += smear_px * 3.0 / 900.0 * np.array([math.cos(k), math.sin(k)])
+        image = room.render({7: (0.14, still, still), 8: (0.14, start, end)}, blur_px=lens_px)
+        by_id = {sighting.id: sighting.blur_px for sighting in detector.search(image)}
+        for _ in range(BLUR_COUNT // 4):
+            edges.add(0.1 * k, [by_id[7]], [by_id[8]])
+    return edges
+
+
+def test_the_smear_of_a_rendered_marker_is_measured_and_told_where_the_exposure_is_not_known():
+    edges = seen_edges(0.6, 6.0)
+    assert 4.0 < edges.motion_px() <= 6.0
+    assert told(GOOD, edges=edges) == [], "of a known exposure it is told what it does at a known speed"
+    (text,) = told(with_(exposure=math.nan), edges=edges)
+    assert text == (
+        f"robots that move are smeared by {edges.motion_px():.1f} px: fix a shorter exposure, with exposure_ms or, "
+        "where that is not taken, in the camera's own settings"
+    )
+    assert told(with_(exposure=math.nan), edges=seen_edges(0.6, 0.0)) == []
+    assert told(with_(exposure=math.nan), edges=EdgeBlur()) == []
+
+
+def test_a_lens_out_of_focus_is_told():
+    (text,) = told(GOOD, edges=seen_edges(2.5, 0.0))
+    assert text.startswith("edges at rest are 1.")
+    assert text.endswith("px wide (sigma): is the lens out of focus, or dirty?")
+
+
+def test_a_few_edges_are_not_enough_and_old_ones_are_forgotten():
+    edges = EdgeBlur()
+    edges.add(0.0, [2.0] * (BLUR_COUNT - 1), [math.nan])
+    assert math.isnan(edges.still_px())
+    assert math.isnan(edges.motion_px())
+    edges.add(1.0, [2.0], [4.0] * BLUR_COUNT)
+    assert edges.still_px() == 2.0
+    assert edges.motion_px() == pytest.approx(12.0)
+    edges.add(1.0 + 2.0 * BLUR_WINDOW, [1.0] * BLUR_COUNT, [1.0] * BLUR_COUNT)
+    assert (edges.still_px(), edges.motion_px()) == (1.0, 0.0)
 
 
 def test_a_good_picture_needs_no_advice():

@@ -135,6 +135,9 @@ def test_a_node_is_told_what_to_look_for_and_its_sightings_become_fixes(room: Co
                 assert (state["status"], state["located"], state["markers"]) == ("ok", True, [7, 40, 41])
                 assert state["node"].startswith("127.0.0.1:")
                 assert state["detect_ms"] == 5.0
+                # Which makes searching for them cheaper: 0.14 and 0.18 m, 2.5 m below 500 px of focal length.
+                sizes = await heard(connection, "sizes")
+                assert 20.0 < sizes["shortest_px"] < 28.0 < 36.0 < sizes["longest_px"] < 45.0
                 await connection.send(status("camera /dev/video0: lost"))
                 await until(lambda: service.cameras["ceiling"].status == "camera /dev/video0: lost")
                 found_health = await health(service)
