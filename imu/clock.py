@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +33,10 @@ JUMP = 0.03
 # device that slept and whose clock stood still); less is a network having a bad time.
 LATE = 0.25
 LATE_FOR = 1.5
+# Neither is a network's bad time always the same: so many buckets in a row that are later by more than JUMP, but alike
+# within ALIKE s, mean a jump.
+ALIKE_BUCKETS = 6
+ALIKE = 0.002
 # s: where counters start again from zero: ticks of 1 ns, 1 us and 1 ms in 16, 24 or 32 bits, the day, the GPS week.
 WRAPS = (2**32 * 1e-9, 2**24 * 1e-6, 2**16 * 1e-3, 2**32 * 1e-6, 2**24 * 1e-3, 86400.0, 604800.0, 2**32 * 1e-3)
 # Questions kept, and by how much (s per s of age) an older one is trusted less: the error of the slope.
@@ -135,6 +139,9 @@ class DeviceClock:
         x = device_time - self._origin[0]
         y = arrival - self._origin[1] - x
         if x // BUCKET > self._bucket:
+            if self._have_moved():
+                self._restart(device_time, arrival)
+                return
             self._fit()
             self._bucket = int(x // BUCKET)
             self._buckets.append((x, y))
@@ -145,12 +152,15 @@ class DeviceClock:
 
     def exchange(self, sent: float, received_device: float, sent_device: float, arrival: float) -> None:
         """The host sent at `sent`, the device received and answered by its own clock, the answer came at `arrival`."""
+        # The other way round a counter has wrapped between them, and nan is neither.
+        if not received_device <= sent_device:
+            return
         received_device, sent_device = (self._unwrap(t, self._device(arrival)) for t in (received_device, sent_device))
         # Not `observe`: samples that were waiting for their batch to fill follow, and are older.
         self._observe(sent_device, arrival)
         round_trip = (arrival - sent) - (sent_device - received_device)
         there = self._line(received_device) - sent
-        if there < 0.0 or round_trip < 0.0 or sent_device < received_device or self._suspect:
+        if there < 0.0 or round_trip < 0.0 or self._suspect:
             return
         self._questions.append(_Question(sent, received_device))
         self._choose()
@@ -228,6 +238,13 @@ class DeviceClock:
         self._forget()
         self._newest = device_time
         self._observe(device_time, arrival)
+
+    def _have_moved(self) -> bool:
+        """Whether the newest buckets lie on a line of their own, above the one that they should."""
+        if len(self._buckets) <= ALIKE_BUCKETS:
+            return False
+        above = [y - self.skew * x - self._offset for x, y in islice(reversed(self._buckets), ALIKE_BUCKETS)]
+        return min(above) > JUMP and max(above) - min(above) < ALIKE
 
     def _fit(self) -> None:
         """Slope and offset from the buckets of the window."""

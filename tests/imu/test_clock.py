@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from benchmarks.links import LINKS, MINIMUM_DELAY, SKEW, Traffic, questions, traffic
 from fusion.measurements import Array
@@ -155,6 +157,44 @@ def test_a_device_clock_that_slept_is_followed() -> None:
     assert clock.to_host(510.0) == pytest.approx(120.005, abs=1e-3)
 
 
+@pytest.mark.parametrize("link", LINKS)
+def test_a_short_sleep_of_the_device_clock_is_followed(link: str) -> None:
+    """A tenth of a second is no more than a network's bad time, but always the same."""
+    before = traffic(LINKS[link], seed=3, seconds=30.0)
+    slept = float(before.t[-1]) + 0.1
+    after = traffic(LINKS[link], seed=4, seconds=15.0, start=slept, device_start=float(before.device[-1]))
+    error, clock = run(one_after_the_other(before, after))
+    assert clock.restarts == 1
+    recovered = error[len(before.t) :][after.t > after.t[0] + 9.0]
+    assert np.abs(recovered - MINIMUM_DELAY).max() < 1.5e-3
+
+
+def test_a_crowded_network_is_not_a_jump() -> None:
+    """For ten seconds nothing comes within 60 ms, and now more, now less."""
+    sent = traffic(LINKS["Wi-Fi"], seed=1, seconds=60.0)
+    random = np.random.default_rng(1)
+    crowded = np.where(
+        (sent.t > 30.0) & (sent.t < 40.0), 0.06 + 0.05 * np.interp(sent.t, np.arange(70), random.random(70)), 0.0
+    )
+    error, clock = run(sent._replace(arrival=np.maximum.accumulate(sent.arrival + crowded)))
+    assert clock.restarts == 0
+    assert np.abs(error[sent.t > 20.0] - MINIMUM_DELAY).max() < 2e-3
+
+
+@settings(max_examples=200)
+@given(st.lists(st.tuples(st.none() | st.floats(-1e12, 1e12), st.floats(0.0, 10.0)), max_size=40))
+def test_whatever_a_device_stamps_times_rise_and_are_not_in_the_future(sent: list[tuple[float | None, float]]) -> None:
+    clock = DeviceClock()
+    arrival, last = 100.0, -math.inf
+    for device_time, pause in sent:
+        arrival += pause
+        clock.exchange(arrival - 0.1, device_time or 0.0, (device_time or 0.0) + 0.01, arrival)
+        stamps = stamp(clock, [device_time], arrival)
+        assert last <= stamps[0] <= arrival
+        last = stamps[0]
+        assert math.isfinite(clock.to_host(7.0))
+
+
 def test_a_stall_is_not_a_jump() -> None:
     """Three seconds of samples arrive at once, the oldest three seconds late."""
     clock = DeviceClock()
@@ -184,7 +224,10 @@ def test_a_better_route_is_taken_at_once() -> None:
     assert clock.to_host(510.0) == pytest.approx(110.0 + earlier, abs=1e-9)
 
 
-@pytest.mark.parametrize("answer", [(10.0, 5.0, 4.9, 10.01), (10.0, 5.0, 5.5, 10.01)])
+@pytest.mark.parametrize(
+    "answer",
+    [(10.0, 5.0, 4.9, 10.01), (10.0, 5.0, 5.5, 10.01), (10.0, math.nan, 5.5, 10.01), (10.0, 5.0, math.nan, 10.01)],
+)
 def test_an_impossible_exchange_is_ignored(answer: tuple[float, float, float, float]) -> None:
     clock = DeviceClock()
     clock.exchange(*answer)
