@@ -170,6 +170,8 @@ LARGEST_PROJECTION_SIGMA_PX = 0.5
 LARGEST_HELD_BACK = 1.3
 # Above this the board is not what it is said to be, or not flat, px
 LARGEST_RMS_PX = 1.0
+# By how much the focal lengths across and down may differ: pixels are square, but printers stretch.
+LARGEST_STRETCH = 0.01
 
 # Fewer views than this are not solved: the lens has 9 unknowns, and each view has 6 of its own.
 SOLVABLE_VIEWS = 4
@@ -480,13 +482,7 @@ def judge(views: Sequence[BoardView], calibration: Calibration | None) -> tuple[
             else "too few views to hold some back",
             "take more views, and hold the board still in each",
         ),
-        _limit(
-            "fit",
-            calibration.rms_px,
-            LARGEST_RMS_PX,
-            f"corners fit to {calibration.rms_px:.2f} px",
-            "check that the board is flat, its squares are square, and that it is the board it is said to be",
-        ),
+        _fit(calibration.rms_px, abs(matrix[0, 0] / matrix[1, 1] - 1.0)),
     )
 
 
@@ -498,6 +494,13 @@ def _count(name: str, value: int, needed: int, text: str, advice: str) -> Criter
 def _limit(name: str, value: float, limit: float, text: str, advice: str) -> Criterion:
     met = value <= limit
     return Criterion(name, met, 1.0 if met else min(1.0, limit / value), text, "" if met else advice)
+
+
+def _fit(rms_px: float, stretch: float) -> Criterion:
+    text = f"corners fit to {rms_px:.2f} px; focal lengths across and down differ by {100.0 * stretch:.1f} %"
+    part = min(1.0, LARGEST_RMS_PX / max(rms_px, 1e-9), LARGEST_STRETCH / max(stretch, 1e-9))
+    advice = "check that it is the board it is said to be, and flat; measure its squares across and down"
+    return Criterion("fit", part == 1.0, part, text, "" if part == 1.0 else advice)
 
 
 def _emptiest(seen: NDArray[np.bool_]) -> str:

@@ -168,9 +168,10 @@ class Guide:
         if "fit" in missing or "held back" in missing:
             advice = next(c.advice for c in self.criteria if c.name in ("fit", "held back") and not c.met)
             return advice[0].upper() + advice[1:], self._rectangle(CELLS // 2, CELLS // 2, view)
+        # A stretched print only shows when the board is not always upright.
         row, column = (int(k) for k in np.unravel_index(int(coverage(self.used).argmin()), (CELLS, CELLS)))
-        text = f"Hold the board to {place_in_words(row, column)}, nearer or further away"
-        return text, self._rectangle(row, column, view)
+        text = f"Turn the board by a quarter, and hold it to {place_in_words(row, column)}"
+        return text, self._rectangle(row, column, view, turned=True)
 
     def _rarest_tilt(self) -> str:
         """The edge that has been furthest away least often."""
@@ -193,16 +194,17 @@ class Guide:
         row, column = np.unravel_index(int((around + 10.0 * seen).argmin()), seen.shape)
         return int(row), int(column)
 
-    def _rectangle(self, row: int, column: int, view: BoardView) -> Array:
-        """The outline of the board held straight, near a cell, within the picture. (4, 2) px"""
-        across, down = self.board.squares
-        size = np.array([across, down], np.float64)
+    def _rectangle(self, row: int, column: int, view: BoardView, turned: bool = False) -> Array:
+        """The outline of the board held straight or turned by a quarter, near a cell, within the picture. (4, 2) px"""
+        size = np.array(self.board.squares, np.float64)
+        size = size[::-1] if turned else size
         picture = np.array([view.width_px, view.height_px], np.float64)
         size *= _FILLED * (picture / size).min()
         middle = (np.array([column, row]) + 0.5) / CELLS * picture
         left, top = np.clip(middle - 0.5 * size, 0.0, picture - size)
         right, bottom = left + size[0], top + size[1]
-        return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        return np.roll(corners, -1, axis=0) if turned else corners
 
 
 def _is_still(before: BoardView, view: BoardView) -> bool:
