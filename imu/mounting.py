@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from fusion.geometry import rotation_about_z
+from fusion.geometry import rotation_about_z, skew
 from fusion.measurements import Array
 
 Metres = Annotated[float, Meta(ge=-10.0, le=10.0)]
@@ -91,41 +91,46 @@ class BodyReadings:
     """
 
     def __init__(self, calibration: ImuCalibration) -> None:
-        self.calibration = calibration
         rotation = rotation_from_deg(calibration.rotation_deg)
-        self._gyro = rotation
-        self._accel = rotation @ np.array(calibration.accel_matrix)
-        self._bias = np.array([*calibration.gyro_bias, *calibration.accel_bias])
+        # (sensor, body axis, IMU axis), and (sensor, IMU axis)
+        self._to_body = np.stack([rotation, rotation @ np.array(calibration.accel_matrix)])
+        self._bias = np.array([calibration.gyro_bias, calibration.accel_bias])
         self._lever = np.array(calibration.position_m)
-        self._same = not given(calibration)
+        self._off_origin = bool(self._lever.any())
+        self._as_it_is = not given(calibration)
         # t, angular rate of the last sample, and the step to it
         self._last = np.full(4, np.nan)
         self._step = 0.0
 
     def __call__(self, readings: Array) -> Array:
         """(n, 7) -> (n, 7): stamps as they are, the rest in body axes and at the body's origin."""
-        if self._same or not len(readings):
+        if self._as_it_is or not len(readings):
             return readings
-        true = readings[:, 1:] - self._bias
         out = np.empty_like(readings)
         out[:, 0] = readings[:, 0]
-        # In sums, not as matrix products, of which the last bit depends on the number of rows.
-        for columns, A in ((slice(0, 3), self._gyro), (slice(3, 6), self._accel)):
-            x, y, z = true[:, columns].T
-            for i in range(3):
-                out[:, 1 + columns.start + i] = A[i, 0] * x + A[i, 1] * y + A[i, 2] * z
-        if self._lever.any():
+        true = readings[:, 1:].reshape(-1, 2, 3) - self._bias
+        out[:, 1:] = _product(self._to_body, true).reshape(-1, 6)
+        if self._off_origin:
             self._to_origin(out)
         return out
 
     def _to_origin(self, out: Array) -> None:
         before = np.vstack([self._last, out[:-1, :4]])
-        step = out[:, 0] - before[:, 0]
+        change = out[:, :4] - before
+        step = change[:, 0]
         # The longer of two steps: a stamp that jitters must not make a blow of its sample's noise.
         longer = np.fmax(np.fmax(step, np.append(self._step, step[:-1])), SHORTEST_STEP)
         known = (step > 0.0) & (step < LONGEST_STEP)
-        a = np.where(known[:, np.newaxis], (out[:, 1:4] - before[:, 1:]) / longer[:, np.newaxis], 0.0)
+        alpha = np.where(known[:, np.newaxis], change[:, 1:] / longer[:, np.newaxis], 0.0)
         self._last, self._step = out[-1, :4].copy(), float(step[-1])
-        w = out[:, 1:4]
-        lever = np.broadcast_to(self._lever, w.shape)
-        out[:, 4:] -= np.cross(a, lever) + np.cross(w, np.cross(w, lever))
+        w, l = out[:, 1:4], self._lever
+        along = w[:, :1] * l[0] + w[:, 1:2] * l[1] + w[:, 2:] * l[2]
+        square = w[:, :1] * w[:, :1] + w[:, 1:2] * w[:, 1:2] + w[:, 2:] * w[:, 2:]
+        # α × l = -[l]x α, and ω × (ω × l) = ω (ω · l) - l (ω · ω)
+        out[:, 4:] -= _product(-skew(l), alpha) + w * along - l * square
+
+
+def _product(A: Array, v: Array) -> Array:
+    """Matrices (..., i, j) times vectors (n, ..., j), in sums: a matrix product's last bit depends on n."""
+    product: Array = A[..., 0] * v[..., :1] + A[..., 1] * v[..., 1:2] + A[..., 2] * v[..., 2:]
+    return product
