@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -238,6 +239,44 @@ def test_the_robots_drive_by_the_published_poses_and_nothing_remains() -> None:
     room.stop()
     assert CHILDREN.read_text() == children
     assert open_files() == before
+
+
+@linux
+def test_the_remote_camera_is_killed_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fixes come from a process with a clock of its own; poses are as good as with the camera here."""
+
+    monkeypatch.setattr("server.demo.room.RESTART", 0.1)
+
+    async def test() -> DemoRoom:
+        room = DemoRoom(remote_camera=True)
+        try:
+            async with Service(at_any_port(room.config()), None, room.open_camera, room.score) as service:
+                room.start(f"ws://127.0.0.1:{service.port}")
+                camera = service.cameras["ceiling"]
+
+                async def until(what: Callable[[], bool]) -> None:
+                    async with asyncio.timeout(TIMEOUT):
+                        while not what():
+                            await asyncio.sleep(0.01)
+
+                await until(lambda: all(score.count >= 40 for score in room._scores.values()))
+                first = room._camera
+                assert first is not None
+                first.kill()
+                await until(lambda: "has gone; waiting for it" in camera.status)
+                frames = camera.frames
+                await until(lambda: camera.frames > frames and camera.status == "")
+                assert room._camera is not None
+                assert room._camera.pid != first.pid
+        finally:
+            room.stop()
+        return room
+
+    children = CHILDREN.read_text()
+    room = asyncio.run(test())
+    for name, score in room._scores.items():
+        assert math.sqrt(score.position_squares / score.count) < 0.1, name
+    assert CHILDREN.read_text() == children
 
 
 @linux
