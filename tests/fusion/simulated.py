@@ -60,7 +60,8 @@ def drive(simulation: Simulation, params: FilterParams | None = None, motion: Mo
         stop = int(np.searchsorted(simulation.arrival, fix.arrival))
         localiser.feed_samples(simulation.samples[at:stop], track[at:stop])
         pose = localiser.latest
-        if pose is not None:
+        # With stamps that jump it may be of an instant that the truth does not cover.
+        if pose is not None and simulation.truth[0, 0] <= pose.t <= simulation.truth[-1, 0]:
             truth = interpolate(simulation.truth, np.array([pose.t]))[0]
             attitude, true_attitude = Rotation.from_quat([pose.quaternion_wxyz, truth[4:]], scalar_first=True)
             errors.append(np.append(truth[1:4] - pose.position, (true_attitude * attitude.inv()).as_rotvec()))

@@ -1,0 +1,365 @@
+"""GIVEN a robot on its way, WHEN something happens to it, THEN its pose is of use, and soon as good as before.
+
+What the sensors suffer is put into a simulated drive with matched noise; the measure is the causal RMSE, beside that of
+the same drive without the mishap, or of holding the last fix. Figures in comments were measured when the test was
+written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fusion.measurements import Array, PoseFix, PoseHypothesis
+from fusion.params import Motion
+from fusion.simulator import (
+    CameraParams,
+    MarkerParams,
+    Simulation,
+    WrongMarker,
+    aggressive,
+    random_ground,
+    simulate,
+)
+from tests.fusion.simulated import drive, held_mm
+
+MOTIONS = pytest.mark.parametrize("motion", ["free", "ground", "differential"])
+SETTLED, AT, SECONDS = 12.0, 20.0, 45.0  # s: the mishap comes at AT
+SEEDS = (0, 1)
+
+
+def healthy(motion: Motion, seed: int, seconds: float = SECONDS, **faults: object) -> Simulation:
+    course = aggressive(seed) if motion == "free" else random_ground(seed)
+    return simulate(course, seed, seconds, **faults)  # type: ignore[arg-type]
+
+
+def samples(simulation: Simulation, change: Callable[[Array], Array]) -> Simulation:
+    """`change` may take some away, by their rows; what arrives when stays."""
+    changed = change(simulation.samples.copy())
+    if len(changed) == len(simulation.samples):
+        return replace(simulation, samples=changed)
+    return replace(simulation, samples=changed, arrival=changed[:, 0].copy())
+
+
+def fixes(simulation: Simulation, change: Callable[[PoseFix], PoseFix | None]) -> Simulation:
+    changed = [fix for fix in map(change, simulation.fixes) if fix is not None]
+    return replace(simulation, fixes=sorted(changed, key=lambda fix: fix.arrival))
+
+
+def poses(fix: PoseFix, change: Callable[[PoseHypothesis], PoseHypothesis]) -> PoseFix:
+    return replace(fix, hypotheses=tuple(map(change, fix.hypotheses)))
+
+
+def between(t: float | Array, seconds: float) -> Array:
+    return (np.asarray(t) > AT) & (np.asarray(t) < AT + seconds)
+
+
+# --- What is no mishap at all
+
+
+@MOTIONS
+def test_every_sample_comes_twice(motion):
+    simulation = healthy(motion, 0)
+    twice = np.repeat(np.arange(len(simulation.samples)), 2)
+    doubled = replace(simulation, samples=simulation.samples[twice], arrival=simulation.arrival[twice])
+    run = drive(doubled, None, motion)
+    np.testing.assert_array_equal(run.track[::2], drive(simulation, None, motion).track)
+    assert run.localiser.counts["imu_duplicates"] == len(simulation.samples)
+
+
+@MOTIONS
+def test_every_fix_comes_twice(motion):
+    """Late the second time; the poses are the same to the last bit."""
+    simulation = healthy(motion, 0)
+    again = [replace(fix, arrival=fix.arrival + 0.2) for fix in simulation.fixes]
+    both = sorted([*simulation.fixes, *again], key=lambda fix: fix.arrival)
+    run = drive(replace(simulation, fixes=both), None, motion)
+    np.testing.assert_array_equal(run.track, drive(simulation, None, motion).track)
+    assert run.localiser.counts["duplicate"] == len(simulation.fixes)
+
+
+@MOTIONS
+def test_stamps_in_steps_of_20_ms(motion):
+    """Four samples in a row have the same stamp: three are dropped. Free 2.1 times the error, ground 1.5."""
+    for seed in SEEDS:
+        simulation = healthy(motion, seed)
+        coarse = simulation.samples.copy()
+        coarse[:, 0] = np.floor(50.0 * coarse[:, 0] + 1e-6) / 50.0
+        run = drive(replace(simulation, samples=coarse), None, motion)
+        assert run.localiser.counts["imu_duplicates"] > 0.7 * len(coarse)
+        assert run.mm(SETTLED) < 3.0 * drive(simulation, None, motion).mm(SETTLED)
+
+
+@MOTIONS
+def test_fixes_held_up_and_then_all_at_once_the_newest_first(motion):
+    for seed in SEEDS:
+        simulation = healthy(motion, seed, camera=CameraParams(rate=5.0))
+        held_up = []
+        for i in range(0, len(simulation.fixes), 4):
+            group = simulation.fixes[i : i + 4]
+            held_up += [replace(fix, arrival=group[-1].arrival) for fix in reversed(group)]
+        run = drive(replace(simulation, fixes=held_up), None, motion)
+        assert run.localiser.counts["rejected"] == run.localiser.counts["reinitialised"] == 0
+        assert run.mm(SETTLED) < 2.0 * drive(simulation, None, motion).mm(SETTLED)
+
+
+@MOTIONS
+def test_a_robot_is_found_while_it_moves(motion):
+    for seed in SEEDS:
+        simulation = fixes(healthy(motion, seed), lambda fix: fix if fix.t > 4.0 else None)
+        assert drive(simulation, None, motion).mm(SETTLED) < 1.1 * drive(healthy(motion, seed), None, motion).mm(
+            SETTLED
+        )
+
+
+# --- The robot
+
+
+@MOTIONS
+def test_it_is_carried_away(motion):
+    away = np.array([2.0, -1.0, 0.0])
+    for seed in SEEDS:
+        simulation = healthy(motion, seed)
+        carried = fixes(
+            simulation, lambda fix: poses(fix, lambda p: replace(p, position=p.position + away * (fix.t > AT)))
+        )
+        truth = simulation.truth.copy()
+        truth[truth[:, 0] > AT, 1:4] += away
+        run = drive(replace(carried, truth=truth), None, motion)
+        assert run.localiser.latest.reset_id == 1
+        assert run.mm(AT + 5.0) < 1.5 * drive(simulation, None, motion).mm(AT + 5.0)
+
+
+@MOTIONS
+def test_a_robot_leaves_the_room_for_a_while_and_comes_back(motion):
+    """Neither IMU nor fixes for 15 s; then it is where it would have been."""
+    for seed in SEEDS:
+        simulation = healthy(motion, seed, 60.0)
+        gone = samples(simulation, lambda a: a[~between(a[:, 0], 15.0)])
+        gone = fixes(gone, lambda fix: None if between(fix.t, 15.0) else fix)
+        run = drive(gone, None, motion)
+        assert run.mm(45.0) < 1.5 * drive(simulation, None, motion).mm(45.0)
+
+
+# --- The camera
+
+
+@MOTIONS
+def test_the_camera_is_lost_for_fifteen_seconds_and_comes_back(motion):
+    for seed in SEEDS:
+        simulation = healthy(motion, seed, 60.0)
+        lost = fixes(simulation, lambda fix: None if between(fix.t, 15.0) else fix)
+        run = drive(lost, None, motion)
+        assert run.mm(45.0) < 1.5 * drive(simulation, None, motion).mm(45.0)
+        assert run.localiser.latest.reset_id == 0
+
+
+COASTS_TOO_LONG = pytest.mark.xfail(strict=True, reason="a speed that nothing measures decays too little: 2.7 x held")
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        pytest.param("free", marks=COASTS_TOO_LONG),
+        pytest.param("ground", marks=COASTS_TOO_LONG),
+        "differential",
+    ],
+)
+def test_without_the_camera_it_is_never_worse_than_holding_the_last_fix(motion):
+    for seed in range(4):
+        lost = fixes(healthy(motion, seed, 60.0), lambda fix: None if between(fix.t, 15.0) else fix)
+        assert drive(lost, None, motion).mm(SETTLED) < held_mm(lost, SETTLED)
+
+
+@MOTIONS
+@pytest.mark.parametrize("degrees", [30.0, 90.0, 180.0])
+def test_a_marker_is_entered_turned(motion, degrees):
+    """It is in view for nine seconds at a time, and all its fixes agree with each other."""
+    for seed in SEEDS:
+        camera = CameraParams(wrong=WrongMarker(turn=math.radians(degrees)))
+        run = drive(healthy(motion, seed, 75.0, camera=camera), None, motion)
+        assert run.localiser.latest.reset_id == 0
+        assert run.deg(SETTLED) < 1.5
+
+
+@MOTIONS
+def test_a_marker_is_entered_in_the_wrong_place(motion):
+    """By 10 cm: its fixes are that far off, and nothing else is."""
+    for seed in SEEDS:
+        camera = CameraParams(wrong=WrongMarker(turn=0.0, shift=(0.1, 0.0, 0.0)))
+        run = drive(healthy(motion, seed, 75.0, camera=camera), None, motion)
+        assert run.mm(SETTLED) < 100.0
+        assert run.deg(SETTLED) < 1.5
+
+
+@MOTIONS
+@pytest.mark.parametrize("late", [-0.15, 0.15])
+def test_stamps_are_wrong_by_150_ms(motion, late):
+    for seed in SEEDS:
+        simulation = healthy(motion, seed, 90.0, camera=CameraParams(stamp_error=late))
+        run = drive(simulation, None, motion)
+        known = fixes(simulation, lambda fix: replace(fix, t=fix.t - late))
+        assert run.localiser.time_offset == pytest.approx(-late, abs=0.015)
+        assert run.mm(60.0) < 1.5 * drive(known, None, motion).mm(60.0)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        "free",
+        pytest.param("ground", marks=pytest.mark.xfail(strict=True, reason="ANEES 1.8 of 8 seeds")),
+        pytest.param("differential", marks=pytest.mark.xfail(strict=True, reason="ANEES 1.7 of 8 seeds")),
+    ],
+)
+def test_fixes_whose_errors_repeat_while_it_stands(motion):
+    """Of a place in the picture, and on the floor of a marker's height and tilt, which are the same all the time."""
+    marker = MarkerParams(field_sigma_px=0.5, on_floor=motion != "free")
+    camera = CameraParams(marker=marker, position=(0.0, 0.0, 4.0))
+    values = [drive(healthy(motion, seed, camera=camera), None, motion).anees for seed in range(8)]
+    assert 0.6 < np.mean(values) < 1.3
+
+
+# --- The IMU
+
+
+@MOTIONS
+def test_the_imu_pauses_for_three_seconds(motion):
+    for seed in SEEDS:
+        simulation = healthy(motion, seed)
+        run = drive(samples(simulation, lambda a: a[~between(a[:, 0], 3.0)]), None, motion)
+        assert run.mm(SETTLED) < 0.6 * held_mm(simulation, SETTLED)
+        assert run.mm(AT + 10.0) < 1.2 * drive(simulation, None, motion).mm(AT + 10.0)
+        assert run.localiser.latest.reset_id == 0
+
+
+def frozen(a: Array) -> Array:
+    where = between(a[:, 0], 3.0)
+    a[where, 1:] = a[np.argmax(where), 1:]
+    return a
+
+
+def zeros(a: Array) -> Array:
+    a[between(a[:, 0], 3.0), 1:] = 0.0
+    return a
+
+
+def spikes(a: Array) -> Array:
+    rng = np.random.default_rng(0)
+    rows = rng.choice(np.flatnonzero(a[:, 0] > SETTLED), 8)
+    a[rows, 1:] = rng.uniform(-1.0, 1.0, (8, 6)) * [35.0, 35.0, 35.0, 150.0, 150.0, 150.0]
+    return a
+
+
+def clock_forth(a: Array) -> Array:
+    a[a[:, 0] > AT, 0] += 0.5
+    return a
+
+
+def clock_back(a: Array) -> Array:
+    a[a[:, 0] > AT, 0] -= 0.5
+    return a
+
+
+BELIEVED = "what cannot be is believed"
+IMU = {
+    "frozen": (frozen, f"{BELIEVED}: 100 m, and 15 s until the fixes are"),
+    "zeros": (zeros, f"{BELIEVED}: 150 m, and 15 s until the fixes are"),
+    "spikes": (spikes, f"{BELIEVED}: 0.2 to 0.7 m"),
+    "its clock jumps forth": (clock_forth, "an offset of 0.5 s is never found: 5 m"),
+    "its clock jumps back": (clock_back, "an offset of 0.5 s is never found: 90 m"),
+}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(change, id=name, marks=pytest.mark.xfail(strict=True, reason=why))
+        for name, (change, why) in IMU.items()
+    ],
+)
+def test_an_imu_that_tells_nonsense_for_a_while_is_better_than_none(change):
+    for motion in ("free", "ground"):
+        for seed in SEEDS:
+            simulation = samples(healthy(motion, seed), change)
+            run = drive(simulation, None, motion)
+            assert run.mm(SETTLED) < held_mm(simulation, SETTLED)
+
+
+# --- Numbers that cannot be
+
+
+def one_sample(column: int, value: float) -> Callable[[Simulation], Simulation]:
+    def change(a: Array) -> Array:
+        a[np.searchsorted(a[:, 0], AT), column] = value
+        return a
+
+    return lambda simulation: samples(simulation, change)
+
+
+def one_fix(**changes: float) -> Callable[[Simulation], Simulation]:
+    def change(simulation: Simulation) -> Simulation:
+        at = len(simulation.fixes) // 2
+        fix = replace(simulation.fixes[at], **changes)
+        return replace(simulation, fixes=[*simulation.fixes[:at], fix, *simulation.fixes[at + 1 :]])
+
+    return change
+
+
+def strayed(metres: float) -> Callable[[Simulation], Simulation]:
+    def change(simulation: Simulation) -> Simulation:
+        at = len(simulation.fixes) // 2
+        fix = poses(simulation.fixes[at], lambda p: replace(p, position=np.full(3, metres)))
+        return replace(simulation, fixes=[*simulation.fixes[:at], fix, *simulation.fixes[at + 1 :]])
+
+    return change
+
+
+FUTURE = "all that comes after is late"
+NUMBERS = {
+    "a fix at 1e9 m": (strayed(1e9), ""),
+    "a fix at 1e300 m": (strayed(1e300), ""),
+    "a fix of long ago": (one_fix(t=-1e9), ""),
+    "a fix of the far future": (one_fix(t=1e6), FUTURE),
+    "a sample of long ago": (one_sample(0, -1e9), ""),
+    "a sample of the far future": (one_sample(0, 1e6), FUTURE),
+    "a rate of 1000 rad/s": (one_sample(1, 1e3), BELIEVED),
+    "a rate of 1e300 rad/s": (one_sample(1, 1e300), "NaN for good"),
+    "a force of 1e300 m/s2": (one_sample(4, 1e300), "NaN for good"),
+}
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(change, id=name, marks=pytest.mark.xfail(strict=True, reason=why) if why else ())
+        for name, (change, why) in NUMBERS.items()
+    ],
+)
+def test_one_number_that_cannot_be_does_no_harm(spoil):
+    simulation = healthy("ground", 1, 40.0)
+    run = drive(spoil(simulation))
+    assert run.mm(AT + 5.0) < 1.1 * drive(simulation).mm(AT + 5.0)
+    assert np.linalg.eigvalsh(run.localiser.latest.covariance)[0] > 0.0
+
+
+@pytest.mark.parametrize("origin", [1.7e9, -1e6])
+def test_any_epoch_of_the_clock(origin):
+    """Floats of seconds since 1970 tell 0.2 us apart."""
+    simulation = healthy("ground", 1, 30.0)
+    truth, moved = simulation.truth.copy(), simulation.samples.copy()
+    truth[:, 0] += origin
+    moved[:, 0] += origin
+    later = fixes(simulation, lambda fix: replace(fix, t=fix.t + origin, arrival=fix.arrival + origin))
+    run = drive(replace(later, samples=moved, arrival=moved[:, 0].copy(), truth=truth))
+    assert run.mm(origin + SETTLED) == pytest.approx(drive(simulation).mm(SETTLED), rel=0.02)
+
+
+def test_a_room_far_from_the_origin():
+    simulation = healthy("ground", 1, 30.0)
+    away = fixes(simulation, lambda fix: poses(fix, lambda p: replace(p, position=p.position + 1e4)))
+    run = drive(replace(away, truth=simulation.truth + 1e4 * np.array([0, 1, 1, 1, 0, 0, 0, 0])))
+    assert run.mm(SETTLED) == pytest.approx(drive(simulation).mm(SETTLED), rel=0.01)
