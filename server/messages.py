@@ -174,8 +174,8 @@ class Dialect:
             # A counter that wraps within the message is no error.
             if span > MESSAGE_SPAN and self.clock.wraps_at is None:
                 raise MessageError(
-                    f"the stamps of one message are {span:.6g} s apart; needed: samples of one clock, in {self._t}, "
-                    f"taken within {MESSAGE_SPAN:.0f} s"
+                    f"the stamps of one message are {span:.6g} s apart; needed: samples of one clock, "
+                    f"in {self.clock.unit}, taken within {MESSAGE_SPAN:.0f} s"
                 )
         return message
 
@@ -201,8 +201,8 @@ class Dialect:
         """A reading of the robot's clock in s, without its wraps: readings come less than half a wrap apart."""
         wraps_at = self.clock.wraps_at
         if wraps_at is not None:
-            if self._ticks == self._ticks:
-                ticks = self._ticks + (ticks - self._ticks + 0.5 * wraps_at) % wraps_at - 0.5 * wraps_at
+            if not math.isnan(self._ticks):
+                ticks += wraps_at * round((self._ticks - ticks) / wraps_at)
             self._ticks = ticks
         return ticks * TIMES[self.clock.unit]
 
@@ -210,10 +210,6 @@ class Dialect:
         """The inverse: what the robot's clock reads."""
         ticks = seconds / TIMES[self.clock.unit]
         return ticks if self.clock.wraps_at is None else ticks % self.clock.wraps_at
-
-    @property
-    def _t(self) -> str:
-        return self.clock.unit
 
 
 def decode_hello(data: str | bytes) -> Hello:

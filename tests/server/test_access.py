@@ -237,7 +237,7 @@ def test_who_is_let_in_is_said_at_the_start(caplog: pytest.LogCaptureFixture) ->
         ("http://robots.example:5679", False, False),
         ("http://localhost:3000", True, True),
         ("http://localhost:3000", False, False),
-        ("file://", True, True),
+        ("file://", False, True),
         ("null", True, False),
         ("http://[::1", True, False),
         ("", True, False),
