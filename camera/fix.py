@@ -324,8 +324,9 @@ def solve_six(view: View, seen: Sequence[Seen]) -> list[tuple[Array, Array, floa
     return sorted(found, key=lambda item: item[2])
 
 
-# A step that lessens the misfit by no more, of which 1 is the sigma of a corner's coordinate, is the last.
-_GAIN = 1e-6
+# A step that lessens the misfit by no more is the last. It is one of ten sigma of a corner's coordinate, or a pixel:
+# over such a distance the projection bends by a thousandth of one.
+_GAIN = 100.0
 
 
 def _planar(
@@ -355,16 +356,17 @@ def _planar(
         misfit = np.add.reduceat(np.square(residual).sum(axis=1), first)
         noise = np.linalg.inv(normal[:, _PLANAR][:, :, _PLANAR])
         step = (noise @ gradient[..., None])[..., 0]
-        if not (((step * gradient).sum(axis=1) > _GAIN) & possible).any():
+        gain = (step * gradient).sum(axis=1)
+        state, misfit = state + step, np.maximum(misfit - gain, 0.0)
+        if not ((gain > _GAIN) & possible).any():
             break
-        state = state + step
-    # How the solved part answers to a motion of the body that the solve does not know of: dx = gain @ motion. Height
+    # How the solved part answers to a motion of the body that it does not know of: dx = response @ motion. Height
     # and tilt are errors of what was assumed ("consider" covariance), a misplaced camera is a motion of all six.
-    gain = noise @ normal[:, _PLANAR]
+    response = noise @ normal[:, _PLANAR]
     assumed = np.zeros((len(seen), 6, 3))
-    assumed[:, _PLANAR] = gain[:, :, _ASSUMED]
+    assumed[:, _PLANAR] = response[:, :, _ASSUMED]
     assumed[:, _ASSUMED] = -np.eye(3)
-    moved = gain @ _body_by_placement(np.column_stack([state[:, :2], np.zeros(len(seen))]), camera)
+    moved = response @ _body_by_placement(np.column_stack([state[:, :2], np.zeros(len(seen))]), camera)
     inflation = [_inflation(m, 2 * n - 3) for m, n in zip(misfit.tolist(), count.tolist(), strict=True)]
     covariance = assumed @ _ASSUMED_COVARIANCE @ assumed.transpose(0, 2, 1)
     covariance[:, _PLANAR_ROWS, _PLANAR] += noise * np.array(inflation)[:, None, None]

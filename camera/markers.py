@@ -41,8 +41,8 @@ class MarkerSighting:
     """One marker in one frame of one camera.
 
     `t`: s, mid-exposure. `corners_px`: (4, 2), clockwise from the marker's top left; pixel (0, 0) is the middle of the
-    first pixel. `sigma_px`: standard deviation of each coordinate. `blur_px`: sigma of the edges' blur, nan where it was
-    not measured.
+    first pixel. `sigma_px`: standard deviation of each coordinate. `blur_px`: sigma of the edges' blur, nan where it is
+    not known.
     """
 
     t: float
@@ -365,7 +365,7 @@ class _Decoder:
         samples = self._samples(image, corners)
         score = self._likeness(samples, ids)
         # Without clear edges there is nothing new: the corners would be those that were predicted.
-        there = (score >= _PICTURE) & (sigma < SIGMA_UNREFINED_PX) & (samples.std(axis=(1, 2)) >= _CONTRAST)
+        there = (score >= _PICTURE) & (sigma < SIGMA_UNREFINED_PX)
         decoded = np.zeros(len(ids), np.bool_)
         if (compare := np.flatnonzero(decode & there)).size:
             marker, turn, ahead, likeness = self._best(samples[compare])

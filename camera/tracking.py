@@ -7,7 +7,6 @@ picture is searched now and then.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -61,10 +60,15 @@ _HARD_AND_TINY = (*_HARD, Pass(2.0, windows=(5, 45, 20)))
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where a marker should be seen: its corners (4, 2), px, and the standard deviation of either coordinate, px."""
+    """Where a marker should be seen: its corners (4, 2), px, and the standard deviation of either coordinate, px.
+
+    `shape_px`: that of the corners about where the marker's middle and heading put them: 0 from a model, since size and
+    perspective are known.
+    """
 
     corners_px: Array
     sigma_px: float
+    shape_px: float = 0.0
 
 
 @dataclass(slots=True)
@@ -73,6 +77,7 @@ class _Track:
 
     t: float
     corners_px: Array
+    sigma_px: float
     velocity_px: Array
     blur_px: float
     decoded: float
@@ -97,7 +102,8 @@ class MarkerTracker:
         self._missed: dict[int, int] = {}
         self._since_search = 0
         self._searched = -math.inf
-        self._searches = itertools.count()
+        # Which of the hard ways is tried next: the one that last found something, for as long as it does.
+        self._hard = 0
 
     def track(
         self,
@@ -132,6 +138,7 @@ class MarkerTracker:
                 id,
                 marker.corners_px,
                 marker.sigma_px,
+                marker.blur_px,
             )
             for id, marker in sorted(found.items())
         ]
@@ -144,10 +151,11 @@ class MarkerTracker:
             if id in expected and expected[id].sigma_px <= _SIGMA_PX:
                 continue
             if id in self._still:
-                own = Prediction(track.corners_px, _SIGMA_PX)
+                own = Prediction(track.corners_px, _SIGMA_PX, track.sigma_px)
             elif 0.0 <= dt <= REMEMBERED:
                 side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
-                own = Prediction(track.corners_px + track.velocity_px * dt, _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt)
+                sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
+                own = Prediction(track.corners_px + track.velocity_px * dt, sigma, track.sigma_px)
             else:
                 continue
             if id not in expected or own.sigma_px < expected[id].sigma_px:
@@ -174,6 +182,7 @@ class MarkerTracker:
             picture,
             near,
             np.array([expected[id].corners_px for id in near]),
+            np.array([expected[id].shape_px for id in near]),
             np.array([3.0 * (expected[id].sigma_px + track.blur_px) for id, track in zip(near, tracks, strict=True)]),
             np.array([t - track.decoded >= DECODE_EVERY for track in tracks]),
         )
@@ -202,14 +211,18 @@ class MarkerTracker:
         shortest, longest = self.sides_px or (math.inf, math.inf)
         cheap = (_LONG, _SHORT) if shortest >= _LONG_PX else (_SHORT,) if shortest >= _SHORT_PX else (_TINY,)
         hard = _HARD if self.sides_px is not None and shortest >= _SHORT_PX else _HARD_AND_TINY
+        last = hard[self._hard % len(hard)]
         bounds = (SMALLEST_SIDE_PX, math.inf) if self.sides_px is None else _about(shortest, longest)
         seen = list(found.values())
-        for way in (*cheap, _THOROUGH, hard[next(self._searches) % len(hard)]):
+        for way in (*cheap, _THOROUGH, last):
             if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
+            before = len(seen)
             seen = distinct(seen + self._detector.look(picture, way, bounds))
             if self.ids <= {marker.id for marker in seen}:
                 break
+        else:
+            self._hard += len(seen) == before
         by_id: dict[int, list[Found]] = {}
         for marker in seen:
             by_id.setdefault(marker.id, []).append(marker)
@@ -225,7 +238,7 @@ class MarkerTracker:
             if before is not None and 0.0 < t - before.t <= REMEMBERED:
                 velocity = (marker.corners_px - before.corners_px) / (t - before.t)
             decoded = t if marker.decoded or before is None else before.decoded
-            self._tracks[id] = _Track(t, marker.corners_px, velocity, marker.blur_px, decoded)
+            self._tracks[id] = _Track(t, marker.corners_px, marker.sigma_px, velocity, marker.blur_px, decoded)
             self._missed[id] = 0
 
 
