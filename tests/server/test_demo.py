@@ -246,8 +246,9 @@ def test_the_remote_camera_is_killed_and_comes_back(monkeypatch: pytest.MonkeyPa
     """Fixes come from a process with a clock of its own; poses are as good as with the camera here."""
 
     monkeypatch.setattr("server.demo.room.RESTART", 0.1)
+    errors: dict[str, float] = {}
 
-    async def test() -> DemoRoom:
+    async def test() -> None:
         room = DemoRoom(remote_camera=True)
         try:
             async with Service(at_any_port(room.config()), None, room.open_camera, room.score) as service:
@@ -259,7 +260,10 @@ def test_the_remote_camera_is_killed_and_comes_back(monkeypatch: pytest.MonkeyPa
                         while not what():
                             await asyncio.sleep(0.01)
 
-                await until(lambda: all(score.count >= 40 for score in room._scores.values()))
+                await until(lambda: all(score.count >= 80 for score in room._scores.values()))
+                errors.update(
+                    {name: math.sqrt(score.position_squares / score.count) for name, score in room._scores.items()}
+                )
                 first = room._camera
                 assert first is not None
                 first.kill()
@@ -270,12 +274,11 @@ def test_the_remote_camera_is_killed_and_comes_back(monkeypatch: pytest.MonkeyPa
                 assert room._camera.pid != first.pid
         finally:
             room.stop()
-        return room
 
     children = CHILDREN.read_text()
-    room = asyncio.run(test())
-    for name, score in room._scores.items():
-        assert math.sqrt(score.position_squares / score.count) < 0.1, name
+    asyncio.run(test())
+    # As long as the camera was there; without it the robots drift as they have learnt little of their IMUs yet.
+    assert max(errors.values()) < 0.05
     assert CHILDREN.read_text() == children
 
 
