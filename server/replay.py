@@ -202,6 +202,8 @@ def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion
             )
         robot = robots[wanted]
         params, motion, engine, imu = robot.filter, robot.motion, robot.engine, robot.imu
+    elif args.robot is not None:
+        raise RecordingError(f"--robot {args.robot}: a robot of which configuration? --config names its file")
     return config.with_settings(params, args.set), args.motion or motion, args.engine or engine, imu
 
 

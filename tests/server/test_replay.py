@@ -445,3 +445,8 @@ def test_hand_held_recording_with_mocap_truth():
     assert 1e3 * error.position_rmse < 13.0
     assert np.degrees(error.attitude_rmse) < 0.32
     assert len(outcomes) == len(recording.fixes)
+
+
+def test_a_robot_without_a_configuration_is_not_ignored(tmp_path, capsys):
+    assert main(["replay", str(plain(tmp_path / "drive")), "--robot", "rover"]) == 2
+    assert "--robot rover: a robot of which configuration? --config names its file" in capsys.readouterr().err
