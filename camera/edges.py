@@ -59,6 +59,11 @@ def refine_corners(
     return corners, sigma, blur
 
 
+def warm_up() -> None:
+    """Compile, or load from numba's cache, before the first picture needs it."""
+    refine_corners(np.zeros((1, 1), np.uint8), np.zeros((1, 4, 2)), 6)
+
+
 @_jit
 def _refine(image, start, cells, reach_px, corners, sigma, blur):
     met = np.empty((4, 2))

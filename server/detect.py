@@ -5,15 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
 from camera.calibration import Intrinsics, load_intrinsics
 from camera.capture import read_image
+from camera.edges import SIGMA_UNREFINED_PX, warm_up
 from camera.fix import MarkerPose, marker_poses
-from camera.markers import DICTIONARIES, DictionaryError, MarkerDetector, MarkerSighting
+from camera.markers import DICTIONARIES, DictionaryError, MarkerDetector, MarkerSighting, Pixels, grey
 from fusion.geometry import quaternion_from_rotation
 
 
@@ -25,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--camera", metavar="CAMERA.toml", help="calibration of the camera, for poses")
     parser.add_argument("--size-mm", type=float, metavar="S", help="side of the markers' black square, for poses")
+    parser.add_argument(
+        "--overlay", type=Path, metavar="FOLDER", help="draw what was seen over each image, as a PNG in this folder"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object per image, one a line")
 
 
@@ -38,17 +45,20 @@ def run(args: argparse.Namespace) -> int:
         if args.size_mm is not None and not 0.0 < args.size_mm < float("inf"):
             raise ValueError(f"--size-mm {args.size_mm:g}: a length above zero is needed")
         intrinsics = None if args.camera is None else load_intrinsics(args.camera)
+        overlays = _overlays(args.images, args.overlay)
     except DictionaryError as error:
         return _fail(f"--dictionary: {error}", 2)
     except ValueError as error:
         return _fail(str(error), 2)
     except OSError as error:
-        return _fail(f"{args.camera}: {error.strerror or error}", 2)
+        return _fail(f"{error.filename}: {error.strerror or error}", 2)
+    # Not in the time that is told for the first image.
+    warm_up()
     size = None if args.size_mm is None else args.size_mm / 1000.0
     failed = False
-    for path in args.images:
+    for path, overlay in zip(args.images, overlays, strict=True):
         try:
-            content = _detect(path, detector, intrinsics, size)
+            content = _detect(path, detector, intrinsics, size, overlay)
         except (OSError, ValueError) as error:
             failed = True
             _fail(str(error) if str(error).startswith(path) else f"{path}: {error}", 1)
@@ -60,14 +70,56 @@ def run(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _detect(path: str, detector: MarkerDetector, intrinsics: Intrinsics | None, size: float | None) -> dict[str, Any]:
-    """What is printed of one image. `ms` is the time of detection and poses, without reading the file."""
+def _detect(
+    path: str, detector: MarkerDetector, intrinsics: Intrinsics | None, size: float | None, overlay: Path | None
+) -> dict[str, Any]:
+    """What is printed of one image. `ms` is the time of detection and poses, without reading and writing files."""
     image = read_image(path)
     if intrinsics is not None:
         intrinsics.check_size(image.shape[1], image.shape[0])
     begin = time.perf_counter()
-    markers = [_marker(sighting, intrinsics, size) for sighting in detector.search(image)]
-    return {"image": path, "markers": markers, "ms": round(1000.0 * (time.perf_counter() - begin), 2)}
+    sightings = detector.search(image)
+    markers = [_marker(sighting, intrinsics, size) for sighting in sightings]
+    content = {"image": path, "markers": markers, "ms": round(1000.0 * (time.perf_counter() - begin), 2)}
+    if overlay is not None:
+        encoded = cv2.imencode(".png", _drawn(image, sightings))[1]
+        overlay.write_bytes(encoded.tobytes())
+        content["overlay"] = str(overlay)
+    return content
+
+
+def _overlays(images: Sequence[str], folder: Path | None) -> list[Path | None]:
+    """The file for each image's overlay. Names never clash, neither with each other nor with the image's own."""
+    if folder is None:
+        return [None] * len(images)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths: list[Path | None] = []
+    for image in images:
+        path, count = folder / f"{Path(image).stem}-markers.png", 1
+        while path in paths:
+            count += 1
+            path = folder / f"{Path(image).stem}-markers-{count}.png"
+        paths.append(path)
+    return paths
+
+
+def _drawn(image: Pixels, sightings: Sequence[MarkerSighting]) -> Pixels:
+    """The image in colour with each marker's outline, first corner and id: green, orange if its edges are unclear."""
+    colour = image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8
+    picture = image.copy() if colour else cv2.cvtColor(grey(image), cv2.COLOR_GRAY2BGR)
+    width = max(1, round(max(image.shape[:2]) / 1000))
+    for sighting in sightings:
+        tint = (0, 200, 0) if sighting.sigma_px < SIGMA_UNREFINED_PX else (0, 128, 255)
+        # Sixteenths of a pixel, see `shift`.
+        corners = np.rint(16.0 * sighting.corners_px).astype(np.int32)
+        cv2.polylines(picture, [corners], True, tint, width, cv2.LINE_AA, shift=4)
+        cv2.circle(picture, corners[0].tolist(), 16 * 3 * width, tint, -1, cv2.LINE_AA, shift=4)
+        x, y = int(sighting.corners_px[:, 0].max()) + 4 * width, int(sighting.corners_px[:, 1].mean())
+        for thickness, shade in ((4 * width, (255, 255, 255)), (width, (0, 0, 200))):
+            cv2.putText(
+                picture, str(sighting.id), (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.7 * width, shade, thickness, cv2.LINE_AA
+            )
+    return np.asarray(picture)
 
 
 def _marker(sighting: MarkerSighting, intrinsics: Intrinsics | None, size: float | None) -> dict[str, Any]:

@@ -85,6 +85,33 @@ def test_a_bad_image_is_named_and_the_others_are_done(steadfix_detect, picture, 
     ]
 
 
+def test_overlays_show_the_markers_and_never_replace_an_image(steadfix_detect, picture, tmp_path):
+    path, truth = picture
+    other = tmp_path / "other" / "room.png"
+    other.parent.mkdir()
+    # 16 bits and grey
+    cv2.imwrite(str(other), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * 200)
+    before = path.read_bytes()
+    known = ("--dictionary", "4X4_50", "--json", "--overlay")
+    status, lines, _ = steadfix_detect(path, other, *known, tmp_path)
+    assert (status, path.read_bytes()) == (0, before)
+    overlays = [json.loads(line)["overlay"] for line in lines]
+    assert overlays == [str(tmp_path / "room-markers.png"), str(tmp_path / "room-markers-2.png")]
+    for overlay in overlays:
+        drawn = cv2.imread(overlay).astype(int)
+        green = (drawn[..., 1] - drawn[..., 2] > 80) & (drawn[..., 1] - drawn[..., 0] > 80)
+        for corners in truth.values():
+            x, y = np.rint(corners[0]).astype(int)
+            assert green[y, x]
+        assert green.mean() < 0.02
+    status, lines, err = steadfix_detect(path, *known, path)
+    assert (status, lines) == (2, [])
+    assert "room.png: File exists" in err
+    status, lines, _ = steadfix_detect(path, *known, tmp_path / "new" / "folder")
+    assert status == 0
+    assert (tmp_path / "new" / "folder" / "room-markers.png").is_file()
+
+
 def test_a_calibration_for_another_image_size_says_both(steadfix_detect, picture):
     path, _ = picture
     camera = path.with_name("other.toml")
