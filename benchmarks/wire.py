@@ -1,0 +1,171 @@
+"""What the WebSocket costs the service: `python -m benchmarks.imu decoding robots` runs it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import multiprocessing as mp
+import os
+import time
+import timeit
+from collections import deque
+from multiprocessing.connection import Connection
+
+import msgspec
+import numpy as np
+from websockets.asyncio.client import ClientConnection, connect
+
+from fusion.measurements import Array, ImuBatch, Pose, PoseFix, PoseHypothesis
+from server.app import Service
+from server.config import parse
+from server.messages import Dialect, Imu
+
+ROBOTS, RATE_HZ, BATCH, POSE_RATE_HZ = 50, 200.0, 10, 50.0
+# s: until all is at its pace, and what is then measured.
+SETTLE, MEASURE = 3.0, 10.0
+# s between the fixes of each robot, and how old they are when they come.
+FIX_EVERY, FIX_DELAY = 0.5, 0.15
+
+
+def decoding() -> None:
+    """Prints us for a message of ten samples, types, ranges and stamps checked, and of json alone, which checks none."""
+    rng = np.random.default_rng(1)
+    rows = np.column_stack([100.0 + np.arange(BATCH) / RATE_HZ, rng.normal(0.0, 1.0, (BATCH, 6))]).round(6).tolist()
+    message = {"type": "imu", "samples": rows}
+    text, binary = json.dumps(message), msgspec.msgpack.encode(message)
+    dialect = Dialect()
+
+    def decode(data: str | bytes) -> None:
+        found = dialect.decode(data)
+        assert isinstance(found, Imu)
+        dialect.readings(found)
+
+    for name, work in (
+        ("JSON", lambda: decode(text)),
+        ("msgpack", lambda: decode(binary)),
+        ("json.loads alone", lambda: json.loads(text)),
+    ):
+        best = min(timeit.repeat(work, number=2000, repeat=20)) / 2000
+        print(f"a batch of {BATCH}, {name:18}{1e6 * best:6.2f} us")
+
+
+def robots() -> None:
+    """Prints the share of a core that the service takes for one robot and for fifty, each with a filter and two fixes a
+    second, and how long after a batch has come the first pose that holds it leaves."""
+    print(f"{'robots':>7}{'samples/s':>11}{'poses/s':>9}{'of a core':>11}{'p50 ms':>9}{'p99 ms':>9}{'format':>10}")
+    for count, format in ((1, "json"), (ROBOTS, "json"), (ROBOTS, "msgpack")):
+        share, samples, poses, _ = _run(count, format, latency=False)
+        *_, delays = _run(count, format, latency=True)
+        p50, p99 = 1e3 * np.percentile(delays, (50, 99))
+        print(f"{count:7}{samples:11.0f}{poses:9.0f}{share:11.3f}{p50:9.2f}{p99:9.2f}{format:>10}", flush=True)
+    print(f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+def _run(count: int, format: str, latency: bool) -> tuple[float, float, float, Array]:
+    context = mp.get_context("spawn")
+    ours, theirs = context.Pipe()
+    service = context.Process(target=_service, args=(theirs, count, latency), daemon=True)
+    service.start()
+    clients = context.Process(target=_clients, args=(ours.recv(), count, format), daemon=True)
+    clients.start()
+    try:
+        found: tuple[float, float, float, Array] = ours.recv()
+        return found
+    finally:
+        clients.kill()
+        service.kill()
+        clients.join()
+        service.join()
+
+
+class _Delays:
+    """A recording of nothing but when samples came, and a receiver of poses: from the one to the other, s."""
+
+    def __init__(self) -> None:
+        self.found: list[float] = []
+        self._waiting: dict[str, deque[float]] = {}
+
+    def imu(self, batch: ImuBatch) -> None:
+        self._waiting.setdefault(batch.robot, deque()).append(batch.arrival)
+
+    def fix(self, fix: PoseFix) -> None: ...
+    def track(self, robot: str, track: Array) -> None: ...
+
+    def pose(self, pose: Pose) -> None:
+        now = time.monotonic()
+        waiting = self._waiting.get(pose.robot, deque())
+        self.found.extend(now - arrival for arrival in waiting)
+        waiting.clear()
+
+
+def _service(pipe: Connection, count: int, latency: bool) -> None:
+    marker = "marker = [{{id = {0}, size_mm = 60}}]"
+    config = "[server]\nport = 0\n" + "".join(f'[[robot]]\nname = "r{i}"\n{marker.format(i)}\n' for i in range(count))
+    pose = PoseHypothesis(np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-5 * np.eye(6))
+    delays = _Delays()
+
+    async def main() -> None:
+        watch = {"recording": delays, "published": delays.pose} if latency else {}
+        async with Service(parse(config), **watch) as service:
+            await service.ready.wait()
+            fixing = asyncio.create_task(fixes(service))
+            pipe.send(service.port)
+            await asyncio.sleep(SETTLE)
+            before = time.process_time(), time.monotonic(), *counts(service)
+            delays.found.clear()
+            await asyncio.sleep(MEASURE)
+            took, passed, samples, poses = (
+                b - a for a, b in zip(before, (time.process_time(), time.monotonic(), *counts(service)), strict=True)
+            )
+            fixing.cancel()
+            pipe.send((took / passed, samples / passed, poses / passed, np.array(delays.found)))
+            await asyncio.Event().wait()
+
+    async def fixes(service: Service) -> None:
+        while True:
+            for name, robot in service.robots.items():
+                await asyncio.sleep(FIX_EVERY / count)
+                now = time.monotonic()
+                robot.feed_fix(PoseFix(name, now - FIX_DELAY, now, (pose,)), now)
+
+    def counts(service: Service) -> tuple[int, int]:
+        robots = service.robots.values()
+        return sum(robot.localiser.counts["imu_samples"] for robot in robots), sum(robot.published for robot in robots)
+
+    asyncio.run(main())
+
+
+def _clients(port: int, count: int, format: str) -> None:
+    codec = msgspec.json if format == "json" else msgspec.msgpack
+    period = BATCH / RATE_HZ
+
+    async def robot(i: int) -> None:
+        async with connect(
+            f"ws://127.0.0.1:{port}/v1/robot", compression=None, proxy=None, ping_interval=None, max_queue=None
+        ) as connection:
+            await send(connection, {"type": "hello", "robot": f"r{i}", "pose_rate_hz": POSE_RATE_HZ})
+            answering = asyncio.create_task(answer(connection))
+            rng = np.random.default_rng(i)
+            due = time.monotonic() + period * i / count
+            while not answering.done():
+                await asyncio.sleep(due - time.monotonic())
+                stamps = due - np.arange(BATCH)[::-1] / RATE_HZ
+                readings = rng.normal(0.0, 0.01, (BATCH, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.80665]
+                await send(connection, {"type": "imu", "samples": np.column_stack([stamps, readings]).tolist()})
+                due += period
+
+    async def send(connection: ClientConnection, message: dict[str, object]) -> None:
+        await connection.send(codec.encode(message), text=format == "json")
+
+    async def answer(connection: ClientConnection) -> None:
+        async for data in connection:
+            received = time.monotonic()
+            # A question is short, a pose is not.
+            if len(data) < 100 and (question := codec.decode(data))["type"] == "clock":
+                times = {"received": received, "sent": time.monotonic()}
+                await send(connection, {"type": "clock", "id": question["id"], **times})
+
+    async def main() -> None:
+        await asyncio.gather(*(robot(i) for i in range(count)))
+
+    asyncio.run(main())
