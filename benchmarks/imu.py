@@ -1,6 +1,6 @@
-"""What the IMU's way costs, and what it is worth: parsers, clocks, lever arms.
+"""What the IMU's way costs, and what it is worth: parsers, clocks, lever arms, the WebSocket.
 
-    .venv/bin/python -m benchmarks.imu [parsers] [clocks] [lever-arms]
+    .venv/bin/python -m benchmarks.imu [parsers] [clocks] [lever-arms] [decoding] [robots]
 
 A parser is compared with the fastest wire that can feed it: 921600 baud, 92160 bytes/s, and 115200 baud for the BNO08x,
 which has no other.
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from benchmarks import links
+from benchmarks import links, wire
 from fusion.consistency import track_error
 from fusion.geometry import rotation_from_quaternion, skew
 from fusion.localiser import Localiser, warm_up
@@ -226,7 +226,13 @@ def _best(work: Callable[[], None], runs: int = 5) -> float:
     return min(times)
 
 
-PARTS = {"parsers": parsers, "clocks": clocks, "lever-arms": lever_arms}
+PARTS = {
+    "parsers": parsers,
+    "clocks": clocks,
+    "lever-arms": lever_arms,
+    "decoding": wire.decoding,
+    "robots": wire.robots,
+}
 
 
 def main() -> None:
