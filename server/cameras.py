@@ -22,7 +22,7 @@ from camera.floor import Anchor, Placement, PlacementError, averaged, load_place
 from camera.markers import MarkerSighting
 from camera.shake import measure_shake, shaken
 from camera.tracking import MarkerTracker
-from fusion.geometry import log_so3, rotation_about_z, transform
+from fusion.geometry import exp_so3, log_so3, rotation_about_z, transform
 from fusion.measurements import Array, Pose, PoseFix
 from server.config import AnchorConfig, CameraConfig, Config, ConfigError, MarkerConfig
 from server.messages import tracker_message
@@ -422,15 +422,14 @@ class Camera:
 
 
 def configured_anchor(config: AnchorConfig) -> Anchor:
-    return Anchor(config.id, config.size_mm / 1000.0, _pose(config.position_m, config.yaw_deg))
+    at = transform(rotation_about_z(math.radians(config.yaw_deg)), config.position_m)
+    return Anchor(config.id, config.size_mm / 1000.0, at)
 
 
 def _mount(config: MarkerConfig) -> MarkerMount:
-    return MarkerMount(config.id, config.size_mm / 1000.0, _pose(config.position_m, config.yaw_deg))
-
-
-def _pose(position_m: tuple[float, float, float], yaw_deg: float) -> Array:
-    return transform(rotation_about_z(math.radians(yaw_deg)), position_m)
+    roll, pitch, yaw = (math.radians(angle) for angle in (config.roll_deg, config.pitch_deg, config.yaw_deg))
+    R = rotation_about_z(yaw) @ exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0])
+    return MarkerMount(config.id, config.size_mm / 1000.0, transform(R, config.position_m))
 
 
 def _moved(kept: Placement, found: Placement) -> float | None:

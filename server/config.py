@@ -96,7 +96,10 @@ class MarkerConfig(Struct, frozen=True, forbid_unknown_fields=True):
     id: MarkerId
     size_mm: MarkerSize
     position_m: Position = (0.0, 0.0, 0.0)
+    roll_deg: Degrees = 0.0
+    pitch_deg: Degrees = 0.0
     yaw_deg: Degrees = 0.0
+    """Turned by roll about the body's x axis, then by pitch about its y, then by yaw about its z."""
 
 
 class ImuConfig(ImuCalibration, frozen=True, forbid_unknown_fields=True):
@@ -164,6 +167,8 @@ _RIGHT = {
     "gyro_bias": "three numbers [x, y, z] in rad/s, each within 1, as `steadfix imu-rest` prints them",
     "accel_bias": "three numbers [x, y, z] in m/s2, each within 5, as `steadfix imu-positions` prints them",
     "accel_matrix": "three rows of three numbers, near 1 on the diagonal, as `steadfix imu-positions` prints them",
+    "roll_deg": "an angle in degrees about the robot's x axis, -360 to 360",
+    "pitch_deg": "an angle in degrees about the robot's y axis, -360 to 360",
     "yaw_deg": "an angle in degrees, anticlockwise, -360 to 360",
     "motion": '"ground", "differential" or "free"',
     "engine": '"numba" or "filterpy"',
