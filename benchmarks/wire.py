@@ -28,7 +28,7 @@ FIX_EVERY, FIX_DELAY = 0.5, 0.15
 
 
 def decoding() -> None:
-    """Prints us for a message of ten samples, types, ranges and stamps checked, and of json alone, which checks none."""
+    """Prints us for a message of ten samples, all of it checked, and of json alone, which checks nothing."""
     rng = np.random.default_rng(1)
     rows = np.column_stack([100.0 + np.arange(BATCH) / RATE_HZ, rng.normal(0.0, 1.0, (BATCH, 6))]).round(6).tolist()
     message = {"type": "imu", "samples": rows}
