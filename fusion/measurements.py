@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# Six printed digits make a variance of nearly nothing negative by so much of what it is made of.
+_AS_PRINTED = np.ones((6, 6)) + 1e-5 * np.eye(6)
+
 
 class MeasurementError(ValueError):
     """A measurement that cannot be one: a wrong shape, NaN, a covariance that is none. The text says which."""
@@ -79,6 +82,10 @@ class PoseHypothesis:
             raise MeasurementError(f"quaternion of norm {norm:.6g}: 1 is needed (order w, x, y, z)")
         if not (np.diag(covariance) > 0.0).all():
             raise MeasurementError("covariance with a variance that is not positive")
+        try:
+            np.linalg.cholesky(covariance * _AS_PRINTED)
+        except np.linalg.LinAlgError:
+            raise MeasurementError("covariance that none can be: it is not positive definite") from None
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "quaternion_wxyz", quaternion / norm)
         object.__setattr__(self, "covariance", 0.5 * (covariance + covariance.T))

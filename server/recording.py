@@ -20,6 +20,7 @@ import csv
 import math
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -171,17 +172,18 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
 
 
-def _number(path: Path, line: int, name: str, text: str | None) -> float:
+def _number(path: Path, line: int, name: str, text: str | None, above: float = -math.inf) -> float:
     if text is None:
         raise RecordingError(f"{path}, line {line}: no value for {name}, the line is too short")
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
+    if not (math.isfinite(value) and value > above):
         found = text.strip() or "empty"
         found = found if len(found) <= 60 else found[:57] + "..."
-        raise RecordingError(f"{path}, line {line}: {name} is {found!r}, a finite number is needed")
+        needed = "a finite number" + (f" above {above:g}" if math.isfinite(above) else "")
+        raise RecordingError(f"{path}, line {line}: {name} is {found!r}, {needed} is needed")
     return value
 
 
@@ -196,8 +198,9 @@ def _must_rise(path: Path, name: str, t: Array) -> None:
     falls = np.flatnonzero(np.diff(t) < 0.0)
     if falls.size:
         row = int(falls[0])
+        line, _ = next(islice(_rows(path), row + 1, None))
         raise RecordingError(
-            f"{path}, line {row + 3}: {name} runs backwards, {t[row + 1]:.6f} after {t[row]:.6f}; "
+            f"{path}, line {line}: {name} runs backwards, {t[row + 1]:.6f} after {t[row]:.6f}; "
             "it must not fall from line to line"
         )
 
@@ -209,8 +212,8 @@ def _load_fixes(path: Path, params: FilterParams) -> list[PoseFix]:
         # a column that is not there, or empty, is absent
         cells = {name: text for name, text in zip(names, row, strict=False) if text.strip()}
 
-        def number(name: str, line: int = line, cells: dict[str, str] = cells) -> float:
-            return _number(path, line, name, cells.get(name))
+        def number(name: str, above: float = -math.inf, line: int = line, cells: dict[str, str] = cells) -> float:
+            return _number(path, line, name, cells.get(name), above)
 
         try:
             hypotheses = [_hypothesis(cells, number, "", params)]
@@ -231,8 +234,8 @@ def _hypothesis(cells: dict[str, str], number: Any, head: str, params: FilterPar
         for (i, j), name in zip(UPPER, COVARIANCE_COLUMNS, strict=True):
             covariance[i, j] = covariance[j, i] = number(head + name)
     else:
-        position = number("sigma_position") if "sigma_position" in cells else params.fix_position_sigma
-        attitude = number("sigma_attitude") if "sigma_attitude" in cells else params.fix_attitude_sigma
+        position = number("sigma_position", 0.0) if "sigma_position" in cells else params.fix_position_sigma
+        attitude = number("sigma_attitude", 0.0) if "sigma_attitude" in cells else params.fix_attitude_sigma
         np.fill_diagonal(covariance, [position**2] * 3 + [attitude**2] * 3)
     pose = [number(head + name) for name in POSE_COLUMNS]
     misfit = number(f"{head}misfit") if f"{head}misfit" in cells else 0.0

@@ -215,6 +215,7 @@ def test_imu_batches_that_cannot_be(change, says):
         (([0, 0, math.nan], [1, 0, 0, 0], np.eye(6)), "not finite"),
         (([0, 0, 0], [1, 1, 0, 0], np.eye(6)), "norm 1.41421"),
         (([0, 0, 0], [1, 0, 0, 0], np.zeros((6, 6))), "not positive"),
+        (([0, 0, 0], [1, 0, 0, 0], np.ones((6, 6)) - 0.5 * np.eye(6)), "not positive definite"),
     ],
 )
 def test_poses_that_cannot_be(arguments, says):

@@ -374,6 +374,14 @@ ROW = ",".join(map(str, circle.imu(np.array([0.0]))[0].tolist()))
             {"imu.csv": f"t_s,gx,gy,gz,ax,ay,az\n0.5{ROW[3:]}\n0.4{ROW[3:]}\n"},
             r"imu.csv, line 3: t_s runs backwards, 0.4",
         ),
+        (
+            {"imu.csv": f"t_s,gx,gy,gz,ax,ay,az\n\n0.5{ROW[3:]}\n\n\n0.4{ROW[3:]}\n"},
+            r"imu.csv, line 6: t_s runs backwards, 0.4",
+        ),
+        (
+            {"fixes.csv": "t_s,arrival_s,x,y,z,qw,qx,qy,qz,sigma_position\n1,1.1,0,0,0,1,0,0,0,-0.005\n"},
+            "fixes.csv, line 2: sigma_position is '-0.005', a finite number above 0 is needed",
+        ),
         ({"imu.csv": "t_s,gx,gy,gz,ax,ay,az\n"}, "imu.csv: no sample"),
         ({"imu.csv": ""}, "imu.csv, line 1: no column t_s"),
         ({"imu.csv": b"\x89PNG\r\n\x1a\n\xff\xfe"}, "imu.csv: this is no text file"),
