@@ -63,8 +63,9 @@ def print_markers(
     """
     found = dictionary_by_name(dictionary)
     there = len(found.bytesList)
-    if unknown := sorted(id for id in ids if not 0 <= id < there):
-        raise PrintError(f"{dictionary} has the ids 0 to {there - 1}, not {', '.join(map(str, unknown))}")
+    unknown = next((id for id in ids if not 0 <= id < there), None)
+    if unknown is not None:
+        raise PrintError(f"{dictionary} has the ids 0 to {there - 1}, not {unknown}")
     side = 1e3 * size
     margin = side / (found.markerSize + 2)
     width, height = _paper(paper)

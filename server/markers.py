@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from collections import Counter
 from pathlib import Path
 
 from camera.markers import DICTIONARIES, DictionaryError
@@ -48,7 +49,8 @@ def _ids(text: str) -> list[int]:
         if last < first:
             raise argparse.ArgumentTypeError(f"{part!r} is no id and no range of them; 7 and 0-11 are")
         ids += range(first, last + 1)
-    if twice := sorted({id for id in ids if ids.count(id) > 1}):
+    twice = [id for id, count in Counter(ids).items() if count > 1]
+    if twice:
         raise argparse.ArgumentTypeError(
             f"id {twice[0]} is there twice: two sheets with one id cannot be told apart, on robots or on the floor"
         )
