@@ -60,7 +60,7 @@ REPEATED = 0.3  # share of readings that are the ones before
 
 GAP = 1.75  # times the usual step
 GAPS_LEAST, GAPS_SHARE = 3, 0.01
-DROPPED_SHARE = 0.01  # of lines or frames
+DROPPED_LEAST, DROPPED_SHARE = 3, 0.01  # lines or frames, and their share, unless it is most of them
 CLOCK_SPAN, CLOCK_SHARE = 2.0, 0.05  # s, share: by how much the device's clock may be fast
 CLOCK_UNITS = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
 # s between the arrivals of batches that are said, and those that are an FTDI's latency timer.
@@ -226,7 +226,7 @@ class StreamHealth:
             yield Finding("imu_degraded", "warning", f"{parser.protocol}: {parser.note}", {"protocol": parser.protocol})
         dropped = parser.dropped
         share = dropped / max(1, parser.frames + dropped)
-        if dropped and share >= DROPPED_SHARE:
+        if share >= (DROPPED_SHARE if dropped >= DROPPED_LEAST else 0.5):
             reason = parser.reasons.most_common(1)[0][0]
             text = f"{share:.0%} of what it sends cannot be used ({_words(reason)}); the latest is {parser.last_error}"
             yield Finding("imu_dropped", "warning", text, {"share": share, **parser.reasons})

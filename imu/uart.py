@@ -59,7 +59,8 @@ class SerialImu:
     def set_baud(self, baud: int) -> None:
         """Go on at another speed, if the port has it; what has come at the old one is dropped."""
         with contextlib.suppress(OSError, ValueError):
-            self._serial.baudrate = self.baud = baud
+            self._serial.baudrate = baud
+            self.baud = baud
             self._serial.reset_input_buffer()
 
     def write(self, data: bytes) -> None:

@@ -156,6 +156,7 @@ class Robot:
             "fix_age": None if pose is None or not math.isfinite(pose.fix_age) else round(pose.fix_age, 3),
             "imu_rate_hz": round(self.imu_rate_hz(now), 1),
             "imu": trouble or "ok",
+            "imu_protocol": None if self.stream.parser is None else self.stream.parser.protocol or None,
             "imu_refused": self.dropped,
             "clock_skew_ppm": round(self.clock.skew * 1e6, 1),
             "clock_restarts": self.clock.restarts,

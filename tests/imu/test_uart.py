@@ -146,6 +146,21 @@ def test_a_speed_that_does_not_exist(device: Device) -> None:
         SerialImu(device.port, -1, lambda *_: None, lambda _: None)
 
 
+def test_another_speed_while_it_is_open(device: Device) -> None:
+    """A pty takes any speed; what counts is that reading goes on, and that a speed nobody has is passed over."""
+    host = Host(device.port)
+    assert host.serial.low_latency is False, "a pty cannot"
+    for baud, then in ((921600, 921600), (-1, 921600)):
+        host.serial.set_baud(baud)
+        assert host.serial.baud == then
+        device.send(LINE)
+        assert host.data.get(timeout=TIMEOUT)[0] in LINE
+        while not host.data.empty():
+            host.data.get()
+    assert host.errors.empty()
+    host.serial.close()
+
+
 def test_something_that_is_no_port(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.touch()

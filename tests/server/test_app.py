@@ -23,6 +23,7 @@ from fusion.measurements import Array, ImuBatch, Pose, PoseFix
 from imu.protocols import RawSample
 from server.app import Service
 from server.config import CameraConfig, Config, ConfigError, parse
+from tests.imu.streams import rvc_frame, steadfix_frame
 from tests.server.room import (
     CAMERA,
     CONFIG,
@@ -644,6 +645,54 @@ def _read_line(fd: int) -> bytes:
     while not line.endswith(b"\n"):
         line += os.read(fd, 1)
     return line
+
+
+def test_a_serial_robot_is_found_out_and_its_mistakes_are_said_before_any_fix(serial_line: tuple[int, str]) -> None:
+    """Steadfix frames in g, after a line of something else: the protocol by itself, the unit in words."""
+    ours, name = serial_line
+    config = CONFIG.replace('name = "cart"', f'name = "cart"\nimu = {{source = "{name}", protocol = "auto"}}')
+    noise = np.random.default_rng(1).normal([0, 0, 0, 0, 0, 1], 1e-3, (60, 6)).tolist()
+
+    async def main() -> None:
+        async with serving(config) as service:
+            cart = service.robots["cart"]
+            await until(lambda: cart.trouble.startswith("it has connected"))
+            os.write(ours, b"hello\n")
+            for i, six in enumerate(noise):
+                os.write(ours, steadfix_frame(i, RawSample(0.01 * i, *six)))
+            await until(lambda: cart.localiser.counts["imu_samples"] == 60)
+            text = "gravity reads 1.0: these are g, not m/s2"
+            assert text in cart.diagnose(time.monotonic())
+            found = await health(service)
+            assert f"robot cart: {text}" in found["reasons"]
+            assert found["robots"]["cart"]["imu_protocol"] == "steadfix"
+            assert found["robots"]["rover"]["imu_protocol"] is None
+
+    run(main)
+
+
+def test_a_robot_without_rates_is_degraded_and_says_so(serial_line: tuple[int, str]) -> None:
+    """A BNO08x in its RVC mode, which turns to the right: the rates are those of its angles."""
+    ours, name = serial_line
+    config = CONFIG.replace('name = "cart"', f'name = "cart"\nimu = {{source = "{name}", protocol = "bno08x-rvc"}}')
+
+    async def main() -> None:
+        async with serving(config) as service:
+            cart = service.robots["cart"]
+            await until(lambda: cart.trouble.startswith("it has connected"))
+            for i in range(50):
+                os.write(ours, rvc_frame(i, 0.5 * i, 0.0, 0.0, (0.0, 0.01 * (i % 3), 9.80665)))
+            await until(lambda: cart.localiser.counts["imu_samples"] == 49)
+            (said,) = [text for text in cart.diagnose(time.monotonic()) if "no angular rates" in text]
+            found = await health(service)
+            assert f"robot cart: {said}" in found["reasons"]
+            assert found["status"] == "degraded"
+            cart.feed_fix(fix("cart"), time.monotonic())
+            pose = cart.publish(time.monotonic())
+            assert pose is not None
+            assert pose.angular_velocity[2] == pytest.approx(-math.radians(50.0), abs=0.1)
+
+    run(main)
 
 
 def test_a_serial_port_that_is_not_there() -> None:
