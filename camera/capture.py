@@ -130,9 +130,9 @@ class LiveSource:
                 with self._changed:
                     self._frame = replace(frame, sequence=sequence, line_time=self._line_time)
                     self._changed.notify_all()
-        except OSError as error:
+        except (OSError, cv2.error) as error:
             with self._changed:
-                self._error = error
+                self._error = error if isinstance(error, OSError) else OSError(f"camera {self._name}: lost ({error})")
                 self._changed.notify_all()
         finally:
             self._device.close()

@@ -79,16 +79,16 @@ class PiCamera:
         """See Device. The other rows follow the first at the sensor's line time."""
         try:
             request = self._camera.capture_request(wait=TIMEOUT)
+            try:
+                metadata = request.get_metadata()
+                # Copied before the release: the buffer is the camera's again afterwards.
+                image = y_plane(request.make_array("main"), *self._size)
+            finally:
+                request.release()
         except TimeoutError:
             raise OSError(f"camera picamera: lost; no frame for {TIMEOUT:g} s") from None
         except RuntimeError as error:
             raise OSError(f"camera picamera: lost ({error})") from None
-        try:
-            metadata = request.get_metadata()
-            # Copied before the release: the buffer is the camera's again afterwards.
-            image = y_plane(request.make_array("main"), *self._size)
-        finally:
-            request.release()
         clocks = host_clocks()
         exposure = 1e-6 * metadata.get("ExposureTime", math.nan)
         # The sensor's stamp is of the first row's readout, which ends its exposure.

@@ -527,7 +527,7 @@ class Service:
             return _text(405, f"{request.method} is not possible here.\n{_THERE_IS}", request)
         if path == "/healthz":
             if not local and not self._is_viewer(bearer(headers)):
-                return _text(401, f"{self._viewers_need()}\n", request)
+                return self._locked(request)
             return _response(200, msgspec.json.encode(self.health()) + b"\n", "application/json", request)
         if path in self._page:
             return _response(200, *self._page[path], request)
@@ -543,7 +543,7 @@ class Service:
         if path == "/":
             # As open as the original was, unless those who look on need a token.
             if self.config.server.token and not local and not self._is_viewer(bearer(headers)):
-                return _text(401, f"{self._viewers_need()}\n", request)
+                return self._locked(request)
         elif not origin_allowed(headers, local, self.config.server.origins):
             origin = headers["origin"]
             log.warning("%s: a page of %s was kept out; `origins` under [server] lets it in", path, _for_log(origin))
@@ -555,10 +555,11 @@ class Service:
     def _is_viewer(self, token: str) -> bool:
         return bool(self.config.server.token) and token_matches(token, self.config.server.token)
 
-    def _viewers_need(self) -> str:
+    def _locked(self, request: Request) -> Response:
         if not self.config.server.token:
-            return "[server] has no token in the configuration, and without one only this machine is served"
-        return "This needs the token of [server] in the configuration, as `Authorization: Bearer <token>`"
+            text = "[server] has no token in the configuration, and without one only this machine is shown anything.\n"
+            return _text(403, text, request)
+        return _text(401, "This needs the token of [server], as `Authorization: Bearer <token>`.\n", request)
 
     # WebSockets
 
@@ -700,7 +701,8 @@ class Service:
         if taken := camera.refusal(time.monotonic()):
             raise RefusedError(taken, retry=True)
         address = _address(visitor.connection)
-        await camera.serve(visitor.connection, address, SERVICE, functools.partial(self._refuse, visitor))
+        refuse = functools.partial(self._refuse, visitor)
+        await camera.serve(visitor.connection, address, SERVICE, visitor.receive, refuse)
 
     async def _serve_robot(self, visitor: _Visitor) -> None:
         hello = await self._hello(visitor, decode_hello)

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
+from imu.protocols import TIME_LIMIT
 from server.messages import ClockAnswer, ClockQuestion, Error, MessageError
 
 # px; no camera is larger.
@@ -19,7 +20,7 @@ _Pixel = Annotated[float, Meta(ge=-100_000.0, le=100_000.0)]
 _Corner = tuple[_Pixel, _Pixel]
 _Size = Annotated[int, Meta(ge=1, le=100_000)]
 # s of any clock.
-_Time = Annotated[float, Meta(ge=-1e12, le=1e12)]
+_Time = Annotated[float, Meta(ge=-TIME_LIMIT, le=TIME_LIMIT)]
 
 
 class CameraHello(Struct, frozen=True, tag_field="type", tag="hello"):

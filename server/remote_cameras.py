@@ -22,6 +22,7 @@ from camera.calibration import CalibrationError
 from camera.exposure import Delivery
 from camera.markers import MarkerSighting
 from imu.clock import DeviceClock
+from imu.protocols import TIME_LIMIT
 from server.camera_messages import (
     CameraHello,
     CameraWelcome,
@@ -114,9 +115,15 @@ class RemoteCamera(Camera):
         return f'camera "{self.config.name}" is already connected, from {self.node}'
 
     async def serve(
-        self, connection: ServerConnection, node: str, service: str, refuse: Callable[[MessageError], Awaitable[None]]
+        self,
+        connection: ServerConnection,
+        node: str,
+        service: str,
+        receive: Callable[[], Awaitable[str | bytes]],
+        refuse: Callable[[MessageError], Awaitable[None]],
     ) -> None:
-        """One connection, after its hello, until it ends or is silent. `node`: where it comes from, in words."""
+        """One connection, after its hello, until it ends (ConnectionClosed). `node`: where it comes from, in words;
+        `receive` gets its next message, `refuse` tells it what was wrong with one."""
         if self._connection is not None:
             self._connection.transport.abort()
         self._connection, self.node, self._heard = connection, node, time.monotonic()
@@ -144,7 +151,8 @@ class RemoteCamera(Camera):
         try:
             await connection.send(encode(welcome), text=True)
             tending = asyncio.create_task(self._tend(connection, questions))
-            async for data in connection:
+            while True:
+                data = await receive()
                 arrival = self._heard = time.monotonic()
                 try:
                     self._hear(questions, data, arrival)
@@ -195,8 +203,8 @@ class RemoteCamera(Camera):
                 asked = questions.pop(id, None)
                 if asked is None:
                     raise MessageError(f"a clock answer with id {id}, which was not asked")
-                if not math.isfinite(received) or not math.isfinite(sent):
-                    raise MessageError("a clock that reads no finite number of seconds")
+                if not max(abs(received), abs(sent)) < TIME_LIMIT:
+                    raise MessageError(f"a clock that reads {max(received, sent)}; seconds are needed")
                 self.clock.exchange(asked, received, sent, arrival)
             case NodeStatus() as status:
                 known = (math.nan if x is None else x for x in (status.exposure, status.white, status.saturated))
