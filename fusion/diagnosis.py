@@ -238,10 +238,13 @@ def _of_arrivals(seen: Seen) -> Iterator[Diagnosis]:
     apart = max(seen.stamps[0] - seen.chunks[-1].t, seen.began - seen.stamps[1]) if seen.chunks else 0.0
     delay = float(np.median([*delays, *seen.lost])) if len(fixes) + lost >= LATE_FIXES else 0.0
     if max(apart, abs(delay)) >= CLOCKS_LEAST and seen.stamps[1] > -math.inf:
-        text = f"the fixes and the samples of the IMU are {apart:.4g} s apart by their stamps"
-        if apart < CLOCKS_LEAST:
-            text = f"fixes arrive {abs(delay):.4g} s {'after' if delay > 0.0 else 'before'} their stamps"
-        text += ": two clocks, or two units?"
+        if abs(delay) >= CLOCKS_LEAST:
+            way = "after" if delay > 0.0 else "before"
+            text = f"fixes arrive {abs(delay):.4g} s {way} their stamps: of another clock, or in another unit"
+        else:
+            text = (
+                f"fixes and IMU samples are {apart:.4g} s apart by their stamps: two clocks or two units, if both ran"
+            )
         yield Diagnosis("fixes_clock", "error", text, {"apart_s": apart, "delay_s": delay})
     age = seen.now - (last if math.isfinite(last) else seen.began)
     if age >= NO_FIX:
