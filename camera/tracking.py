@@ -41,6 +41,8 @@ _SIGMA_PX, _SWERVE = 1.0, 20.0
 _GIVEN_UP = 5
 # Frames, and s, between two searches of the whole picture while a marker is missing.
 SEARCH_EVERY, SEARCH_INTERVAL = 10, 0.5
+# s between two while none is missing, lest one is there twice.
+SWEEP_INTERVAL = 5.0
 
 # Around a marker's place: one window is enough for one that is sharp and well lit, three find most others.
 _NEARBY = (Pass(windows=(13, 13, 10), darker=10.0), Pass())
@@ -101,7 +103,7 @@ class MarkerTracker:
         # Frames since a marker was last seen, of those that were.
         self._missed: dict[int, int] = {}
         self._since_search = 0
-        self._searched = -math.inf
+        self._searched = self._swept = -math.inf
         # Which of the hard ways is tried next: the one that last found something, for as long as it does.
         self._hard = 0
 
@@ -128,8 +130,11 @@ class MarkerTracker:
         if missing := self.ids - found.keys():
             due = self._since_search >= SEARCH_EVERY or not 0.0 <= t - self._searched < SEARCH_INTERVAL
             if due or any(self._missed.get(id) == 0 for id in missing):
-                found = self._search(picture, found)
+                found = self._search(picture, found, missing=True)
                 self._since_search, self._searched = 0, t
+        elif not 0.0 <= t - self._swept < SWEEP_INTERVAL:
+            found = self._search(picture, found, missing=False)
+            self._swept = t
         self._remember(found, t)
         return [
             MarkerSighting(
@@ -206,15 +211,19 @@ class MarkerTracker:
             found |= _nearest([marker for marker in looked if marker.id in left], left)
         return found
 
-    def _search(self, picture: Image, found: dict[int, Found]) -> dict[int, Found]:
-        """The whole picture: cheaply, then with everything that the default detector does, then one way more."""
+    def _search(self, picture: Image, found: dict[int, Found], missing: bool) -> dict[int, Found]:
+        """The whole picture: cheaply; while one is missing with everything that the default detector does, too, and in
+        one way more."""
         shortest, longest = self.sides_px or (math.inf, math.inf)
         cheap = (_LONG, _SHORT) if shortest >= _LONG_PX else (_SHORT,) if shortest >= _SHORT_PX else (_TINY,)
         hard = _HARD if self.sides_px is not None and shortest >= _SHORT_PX else _HARD_AND_TINY
         last = hard[self._hard % len(hard)]
         bounds = (SMALLEST_SIDE_PX, math.inf) if self.sides_px is None else _about(shortest, longest)
         seen = list(found.values())
-        for way in (*cheap, _THOROUGH, last):
+        if self.repeated or not missing:
+            # The best of them: the others may see one of two.
+            cheap = cheap[-1:]
+        for way in (*cheap, _THOROUGH, last) if missing else cheap:
             if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
             before = len(seen)

@@ -115,6 +115,8 @@ class Camera:
         self.unlocated = "no anchor has been seen yet"
         self.frames = 0
         self.markers: tuple[int, ...] = ()
+        # Ids that are in view more than once.
+        self.repeated: frozenset[int] = frozenset()
         self.last_frame = -math.inf
         self.detect_ms = math.nan
         self._deliver = deliver
@@ -268,7 +270,18 @@ class Camera:
                 self._sides_of, self._tracking.sides_px = placement, self._sides_px(placement)
             poses = self._poses_at(t)
             predictions = predict(self._bodies, poses, self.intrinsics, placement.world_from_camera, frame.line_time)
-        return self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
+        sightings = self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
+        if (repeated := self._tracking.repeated) != self.repeated:
+            self.repeated = repeated
+            for text in self._repetitions().values():
+                log.warning("camera %s: %s", self.config.name, text)
+        return sightings
+
+    def _repetitions(self) -> dict[str, str]:
+        return {
+            f"marker {id}": f"marker {id} is in view more than once; which one is meant cannot be told, so none is used"
+            for id in sorted(self.repeated)
+        }
 
     def _sides_px(self, placement: Placement) -> tuple[float, float]:
         """How long the sides of the smallest and the largest marker appear, anywhere in the picture."""
@@ -367,8 +380,8 @@ class Camera:
         """What would make its picture better, in words, by what it is about."""
         delivery = self.delivery(now)
         if delivery is None:
-            return {}
-        return advice(
+            return self._repetitions()
+        return self._repetitions() | advice(
             delivery,
             self._edges,
             focal_px=self._focal_px,
