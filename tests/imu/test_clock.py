@@ -100,9 +100,9 @@ def test_a_counter_that_starts_again_from_zero_changes_nothing(link: str, wrap: 
 
 def test_an_answer_from_beyond_the_wrap_is_no_round_trip() -> None:
     """It overtakes the samples by which the wrap is noticed."""
-    clock = DeviceClock()
-    steady(clock, 100.0, WRAPS[3] - 10.0, 10.0)
-    clock.exchange(109.9, WRAPS[3] - 0.095, WRAPS[3] - 0.094, 109.911)
+    clock, wrap = DeviceClock(), 2**32 * 1e-6
+    steady(clock, 100.0, wrap - 10.0, 10.0)
+    clock.exchange(109.9, wrap - 0.095, wrap - 0.094, 109.911)
     clock.exchange(110.0, 0.005, 0.006, 110.011)
     assert clock.minimum_delay == pytest.approx(0.005, abs=1e-4)
     steady(clock, 110.01, 0.01, 1.0)
