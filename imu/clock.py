@@ -37,8 +37,8 @@ LATE_FOR = 1.5
 # within ALIKE s, mean a jump.
 ALIKE_BUCKETS = 6
 ALIKE = 0.002
-# s: where counters start again from zero: ticks of 1 us and 1 ms in 16, 24 or 32 bits, the day, the GPS week. Not less: a
-# device that restarts again and again would be taken for one whose counter wraps.
+# s: where counters start again from zero: ticks of 1 us and 1 ms in 16, 24 or 32 bits, the day, the GPS week. Not below
+# some seconds: a device that restarts again and again would be taken for one whose counter wraps.
 WRAPS = (2**24 * 1e-6, 2**16 * 1e-3, 2**32 * 1e-6, 2**24 * 1e-3, 86400.0, 604800.0, 2**32 * 1e-3)
 # Questions kept, and by how much (s per s of age) an older one is trusted less: the error of the slope.
 EXCHANGES = 64
