@@ -4,8 +4,9 @@ A sample that the device stamped `d` arrives at `host(d) + delay`, and `delay` h
 again. A straight line under all points (d, arrival), touching them, is therefore the device's clock plus that minimum
 delay: V. Paxson, "On calibrating measurements of packet transit times" (SIGMETRICS 1998); the line is the edge of the
 lower convex hull under the middle of the window: S. Moon, P. Skelly, D. Towsley, "Estimation and removal of clock
-skew from network delay measurements" (INFOCOM 1999). What is left, the minimum delay itself, is removed by the
-four-timestamp exchange of NTP (RFC 5905, section 8) where the device answers one.
+skew from network delay measurements" (INFOCOM 1999). What is left, the minimum delay itself, is half the best round
+trip where the device answers the four-timestamp exchange of NTP (RFC 5905, section 8). The best way there and the best
+way back are taken each for itself, since they rarely fall into one exchange; the way back is the samples' line.
 """
 
 from __future__ import annotations
