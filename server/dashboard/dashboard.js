@@ -25,6 +25,8 @@ const seconds = () => performance.now() / 1000;
 
 const robots = new Map(); // name -> {pose, place, received, trail, colour}; place: the last pose that means anything
 let health = null;
+let token = localStorage.getItem("steadfix-token") ?? "";
+let locked = false;
 let socket = null;
 let retry = 0;
 let pause = 0.5;
@@ -34,12 +36,13 @@ let dirty = true;
 
 function connect() {
   clearTimeout(retry);
-  if (document.hidden || socket) return;
+  if (document.hidden || socket || locked) return;
   const scheme = location.protocol === "https:" ? "wss:" : "ws:";
   const opened = new WebSocket(`${scheme}//${location.host}/v1/poses?rate=${RATE_HZ}`);
   socket = opened;
   opened.onopen = () => {
     pause = 0.5;
+    if (token) opened.send(JSON.stringify({ type: "hello", token }));
     showState();
     fetchHealth();
   };
@@ -64,6 +67,27 @@ function disconnect() {
 }
 
 document.addEventListener("visibilitychange", () => (document.hidden ? disconnect() : connect()));
+
+// From another machine the service wants a token, and tells nothing until it has it.
+function lock(open, text) {
+  locked = true;
+  disconnect();
+  const form = element("locked");
+  form.querySelector("label").hidden = form.querySelector("button").hidden = !open;
+  const wrong = token ? "That is not the token." : "From another machine, this service wants its token.";
+  setText(element("locked-text"), open ? wrong : text);
+  form.hidden = false;
+  showState();
+}
+
+element("locked").addEventListener("submit", (event) => {
+  event.preventDefault();
+  token = element("token").value;
+  localStorage.setItem("steadfix-token", token);
+  locked = false;
+  element("locked").hidden = true;
+  connect();
+});
 
 function take(pose) {
   const robot = robotNamed(pose.robot);
@@ -90,7 +114,13 @@ function robotNamed(name) {
 async function fetchHealth() {
   if (document.hidden) return;
   try {
-    health = await (await fetch("/healthz", { cache: "no-store", signal: AbortSignal.timeout(3000) })).json();
+    const headers = token ? { Authorization: `Bearer ${token}` } : {};
+    const answer = await fetch("/healthz", { cache: "no-store", headers, signal: AbortSignal.timeout(3000) });
+    if (answer.status === 401 || answer.status === 403) {
+      lock(answer.status === 401, await answer.text());
+      return;
+    }
+    health = await answer.json();
     // In the order of the configuration, so that each robot keeps its colour.
     for (const name of Object.keys(health.robots)) robotNamed(name);
     dirty = true;
@@ -111,13 +141,15 @@ function showState() {
     kind = reasons.length ? "fair" : "good";
     const count = Object.keys(health.robots).length;
     text = reasons.length ? "Something is missing" : `${count} ${count === 1 ? "robot" : "robots"}, all well`;
+  } else if (locked) {
+    text = "Locked";
   } else if (!health) {
     kind = "";
     text = "Connecting";
   }
   element("state").className = kind;
   setText(element("state-text"), text);
-  element("lost").hidden = connected || !health;
+  element("lost").hidden = connected || locked || !health;
   showList("trouble", connected ? reasons : []);
   const advice = Object.entries(health?.cameras ?? {}).flatMap(([name, camera]) =>
     camera.advice.map((text) => `camera ${name}: ${text}`),

@@ -149,7 +149,7 @@ def test_without_a_token_only_this_machine_looks_on_but_the_original_stream_is_o
     run(main)
 
 
-@pytest.mark.parametrize(("config", "token", "status"), [(TOKENS, "look", 200), (TOKENS, "x", 401), (CONFIG, "", 401)])
+@pytest.mark.parametrize(("config", "token", "status"), [(TOKENS, "look", 200), (TOKENS, "x", 401), (CONFIG, "", 403)])
 def test_health_from_elsewhere(config: str, token: str, status: int) -> None:
     async def main() -> None:
         async with serving(config) as service:

@@ -26,15 +26,17 @@ pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"{CHROMIUM} is no
 
 
 @contextlib.asynccontextmanager
-async def tab(service: Service) -> AsyncIterator[Page]:
+async def tab(service: Service, host: str = "127.0.0.1") -> AsyncIterator[Page]:
     """The page in a browser of its own. It must have nothing to complain of."""
     complaints: list[str] = []
     async with async_playwright() as playwright:
-        chromium = await playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        chromium = await playwright.chromium.launch(
+            executable_path=CHROMIUM, args=[*FLAGS, "--host-resolver-rules=MAP steadfix.example 127.0.0.1"]
+        )
         try:
             page = await chromium.new_page(viewport={"width": 1280, "height": 800})
             page.on("pageerror", lambda error: complaints.append(str(error)))
-            await page.goto(f"http://127.0.0.1:{service.port}/")
+            await page.goto(f"http://{host}:{service.port}/")
             yield page
         finally:
             await chromium.close()
@@ -173,5 +175,52 @@ def test_digits_do_not_jitter_and_both_schemes_are_there() -> None:
                 brightness.append(sum(map(int, colour.removeprefix("rgb(").removesuffix(")").split(","))))
             assert brightness[0] > 600
             assert brightness[1] < 120
+
+    run(main)
+
+
+def test_from_another_machine_the_page_asks_for_the_token() -> None:
+    async def main() -> None:
+        async with (
+            serving(CONFIG.replace("[server]", '[server]\ntoken = "look"')) as service,
+            tab(service, "steadfix.example") as page,
+        ):
+            service.robots["rover"].feed_fix(fix(), time.monotonic())
+            text = "document.getElementById('locked-text').innerText"
+            await see(page, f"{text} === 'From another machine, this service wants its token.'")
+            await page.fill("#token", "guessed")
+            await page.click("#locked button")
+            await see(page, f"{text} === 'That is not the token.'")
+            assert await page.inner_text("#state-text") == "Locked"
+            await page.fill("#token", "look")
+            await page.click("#locked button")
+            await see(page, f"{ROW.format('rover')}?.cells[3].innerText > ''")
+            assert not await page.is_visible("#locked")
+            # It is kept.
+            await page.reload()
+            await see(page, f"{ROW.format('rover')}?.cells[3].innerText > ''")
+        async with serving() as service, tab(service, "steadfix.example") as page:
+            await see(page, f"{text}.startsWith('[server] has no token')")
+            assert not await page.is_visible("#token")
+
+    run(main)
+
+
+@pytest.mark.parametrize("width", [360, 400, 600])
+def test_all_columns_are_seen_on_a_phone(width: int) -> None:
+    async def main() -> None:
+        config = CONFIG.replace("rover", "a-robot-with-a-name-that-goes-on")
+        async with serving(config) as service, tab(service) as page:
+            await page.set_viewport_size({"width": width, "height": 800})
+            name = "a-robot-with-a-name-that-goes-on"
+            # The longest words and numbers that there are.
+            await see(page, f"{ROW.format(json.dumps(name))}?.cells[1].innerText === 'waiting'")
+            for cell, text in ((1, "degraded"), (2, "88.88"), (3, "999+"), (4, "9999+")):
+                await page.evaluate(f"{ROW.format(json.dumps(name))}.cells[{cell}].innerText = '{text}'")
+            right = (
+                "Math.max(...[...document.querySelectorAll('#robots td')].map((c) => c.getBoundingClientRect().right))"
+            )
+            assert await page.evaluate(right) <= width
+            assert await page.evaluate("document.documentElement.scrollWidth") <= width
 
     run(main)
