@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fusion.localiser import Localiser
 from fusion.measurements import Array, PoseFix, PoseHypothesis
 from fusion.params import Motion
 from fusion.simulator import (
@@ -287,6 +288,54 @@ def test_an_imu_that_tells_nonsense_for_a_while_is_better_than_none(change):
             simulation = samples(healthy(motion, seed), change)
             run = drive(simulation, None, motion)
             assert run.mm(SETTLED) < held_mm(simulation, SETTLED)
+
+
+# --- The smooth channel
+
+
+def camera_lost(motion: Motion) -> Simulation:
+    return fixes(healthy(motion, 0), lambda fix: None if between(fix.t, 15.0) else fix)
+
+
+def imu_pauses(motion: Motion) -> Simulation:
+    return samples(healthy(motion, 0), lambda a: a[~between(a[:, 0], 3.0)])
+
+
+def carried(motion: Motion) -> Simulation:
+    return fixes(
+        healthy(motion, 0), lambda fix: poses(fix, lambda p: replace(p, position=p.position + 2.0 * (fix.t > AT)))
+    )
+
+
+def marker_displaced(motion: Motion) -> Simulation:
+    wrong = WrongMarker(turn=0.0, shift=(0.1, 0.0, 0.0))
+    return healthy(motion, 1, camera=CameraParams(wrong=wrong))
+
+
+@pytest.mark.parametrize("motion", ["free", "ground"])
+@pytest.mark.parametrize("mishap", [camera_lost, imu_pauses, carried, marker_displaced])
+def test_no_step_that_is_not_told(mishap, motion):
+    """Beyond what its own velocity moves it in 5 ms: 0.3 m/s make 1.5 mm, the change of the velocity the rest."""
+    simulation = mishap(motion)
+    localiser = Localiser("robot", motion=motion)
+    waiting = list(simulation.fixes)
+    before, steps, told = None, [], 0
+    for sample, arrival in zip(simulation.samples, simulation.arrival, strict=True):
+        while waiting and waiting[0].arrival <= arrival:
+            localiser.feed(waiting.pop(0))
+        localiser.feed_samples(sample[np.newaxis])
+        pose = localiser.pose_at(sample[0], "smooth")
+        if before is not None and pose.t - before.t < 0.02:
+            moved = pose.position - before.position - (pose.t - before.t) * 0.5 * (pose.velocity + before.velocity)
+            if pose.reset_id == before.reset_id:
+                steps.append(np.linalg.norm(moved))
+            else:
+                told += 1
+                assert np.linalg.norm(pose.reset_step) > 0.0
+        before = pose
+    assert max(steps) < 0.003
+    assert len(steps) > 7000
+    assert told >= (mishap is carried)
 
 
 # --- Numbers that cannot be
