@@ -206,7 +206,8 @@ class StreamHealth:
         if len(rows) < LEAST or 0.0 < float(steps.sum()) < LEAST_SECONDS:
             return found
         rest = self.rest()
-        found += _of_stuck(rows)
+        derived = self.parser is not None and bool(self.parser.note)
+        found += _of_stuck(rows, ("sensor",) if derived else ("sensor", "gyroscope", "accelerometer"))
         if not any(finding.code == "imu_stuck" and finding.severity == "error" for finding in found):
             found += _of_force(rows)
             found += _of_rates(rows, rest)
@@ -254,11 +255,12 @@ class StreamHealth:
         yield Finding("imu_batches", "note", text, {"interval_ms": ms, "samples": interval / step})
 
 
-def _of_stuck(rows: Array) -> Iterator[Finding]:
-    """Readings that repeat themselves, which a sensor's noise does not allow."""
+def _of_stuck(rows: Array, names: Sequence[str]) -> Iterator[Finding]:
+    """Readings that repeat themselves, which a sensor's noise does not allow; derived rates may well be all zero."""
     t = rows[:, _T]
     same = np.diff(rows[:, 3:], axis=0) == 0.0
-    for name, columns in (("sensor", slice(0, 6)), ("gyroscope", slice(0, 3)), ("accelerometer", slice(3, 6))):
+    for name in names:
+        columns = {"sensor": slice(0, 6), "gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}[name]
         changes = np.flatnonzero(~same[:, columns].all(axis=1))
         first = int(changes[-1]) + 1 if len(changes) else 0
         count = len(rows) - first

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import math
 import os
 import queue
@@ -15,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
+import msgspec
 import numpy as np
 
 from imu.clock import DeviceClock
@@ -81,7 +81,8 @@ def run(args: argparse.Namespace) -> int:
         error = str(lost)
     report = watch.report()
     if args.json:
-        print(json.dumps(report | {"error": error or None}))
+        # A number that is none becomes null.
+        print(msgspec.json.encode(report | {"error": error or None}).decode())
     else:
         view.clear()
         print(_text(report))
@@ -240,8 +241,11 @@ class _View:
             self.clear()
             text = _text(watch.report())
             # Long lines are broken here: how the terminal breaks them, nobody tells.
-            width = max(20, os.get_terminal_size(sys.stdout.fileno()).columns or 80)
+            columns, rows = os.get_terminal_size(sys.stdout.fileno())
+            width = max(20, columns or 80)
             lines = [line[at : at + width] for line in text.splitlines() for at in range(0, max(1, len(line)), width)]
+            # What has scrolled out of sight cannot be erased.
+            lines = lines[: max(1, (rows or 25) - 1)]
             print("\n".join(lines), flush=True)
             self._lines = len(lines)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from typing import Literal, get_args
 
@@ -19,11 +18,13 @@ from imu.protocols.witmotion import WitMotion
 ProtocolName = Literal[
     "auto", "json", "csv", "steadfix", "witmotion", "bno08x-rvc", "vectornav", "vectornav-binary", "mavlink"
 ]
-# bits/s, in the order in which they are tried.
-BAUD_RATES = (115200, 921600, 460800, 230400, 57600, 38400, 9600, 19200, 1_000_000, 2_000_000)
-# Samples by which a protocol is recognised, and bytes without after which the next speed is tried.
+# bits/s, in the order in which they are tried: those that devices come with first.
+BAUD_RATES = (115200, 9600, 57600, 921600, 460800, 230400, 38400, 19200, 1_000_000, 2_000_000)
+# Samples by which a protocol is recognised.
 ENOUGH = 4
-PUZZLED = 4096
+# Bytes without them after which the next speed is tried: of what is neither text nor has a single good frame, which a
+# wrong speed looks like, and of anything.
+NOISE, PUZZLED = 512, 4096
 
 
 def open_parser(protocol: ProtocolName, columns: str = "", baud: int = 0) -> Parser:
@@ -67,9 +68,12 @@ class Detector(Parser):
     def _begin(self) -> None:
         self._heard = b""
         self._candidates: list[tuple[Parser, list[RawSample]]] = []
+        self._absent = ""
         for make in self._makers.values():
-            with contextlib.suppress(MavlinkMissingError):
+            try:
                 self._candidates.append((make(), []))
+            except MavlinkMissingError as error:
+                self._absent = str(error)
 
     def feed(self, data: bytes) -> list[RawSample]:
         samples = self._try(data) if self._chosen is None else self._chosen.feed(data)
@@ -84,7 +88,7 @@ class Detector(Parser):
                 self._choose(parser)
                 return samples
             if self._heard.strip():
-                self._drop(DroppedError("not recognised", describe(self._heard)))
+                self._give_up()
         return []
 
     def _best(self) -> tuple[Parser, list[RawSample]]:
@@ -108,23 +112,33 @@ class Detector(Parser):
                 return samples
         self._heard += data[:PUZZLED]
         self.dropped_bytes += len(data)
-        if len(self._heard) >= PUZZLED and self._best()[0].frames >= ENOUGH:
+        best, _ = self._best()
+        if len(self._heard) >= PUZZLED and best.frames >= ENOUGH:
             # A known protocol, with other messages than those wanted.
-            self._choose(self._best()[0])
-        elif len(self._heard) >= PUZZLED:
-            self._drop(
-                DroppedError("not recognised", describe(self._heard) + (f" (at {self.baud} baud)" if self.baud else ""))
-            )
+            self._choose(best)
+        elif len(self._heard) >= (PUZZLED if best.frames or _is_text(self._heard) else NOISE):
+            self._give_up()
             if self.baud:
                 self.baud = self._bauds[(self._bauds.index(self.baud) + 1) % len(self._bauds)]
             self._begin()
         return []
 
+    def _give_up(self) -> None:
+        found = describe(self._heard)
+        if self.baud:
+            found += f" (at {self.baud} baud)"
+        if self._absent and not _is_text(self._heard):
+            found += f"; {self._absent}"
+        self._drop(DroppedError("not recognised", found))
+
+
+def _is_text(data: bytes) -> bool:
+    return sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) > 0.95 * len(data)
+
 
 def describe(data: bytes) -> str:
     """In words, what bytes look like that no parser understands."""
-    printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) / max(1, len(data))
-    if printable > 0.95 and b"\n" in data:
+    if _is_text(data) and b"\n" in data:
         lines = [line.strip() for line in data.split(b"\n")[1:-1] if line.strip()]
         line = lines[len(lines) // 2] if lines else data.strip()
         what = f"text of no known form, such as {line[:80].decode(errors='replace')!r}"

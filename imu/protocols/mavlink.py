@@ -39,7 +39,7 @@ class Mavlink(FrameParser):
             from pymavlink.dialects.v20 import all as dialect
         except ImportError:
             raise MavlinkMissingError(
-                "MAVLink needs pymavlink, which is not installed: pip install 'steadfix[mavlink]'"
+                "MAVLink needs pymavlink, which is not installed: pip install pymavlink"
             ) from None
         self._messages: dict[int, Any] = dialect.mavlink_map
         self._checksum = dialect.x25crc

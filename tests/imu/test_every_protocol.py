@@ -8,6 +8,7 @@ import math
 import shutil
 import struct
 import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import get_args
@@ -23,7 +24,7 @@ from imu.protocols.bno08x_rvc import Bno08xRvc
 from imu.protocols.csv_lines import ColumnsError, CsvLines, parse_columns
 from imu.protocols.detection import Detector, ProtocolName, describe, open_parser
 from imu.protocols.frames import START_ROOM
-from imu.protocols.mavlink import Mavlink
+from imu.protocols.mavlink import Mavlink, MavlinkMissingError
 from imu.protocols.steadfix_frames import SteadfixFrames, encode
 from imu.protocols.vectornav_ascii import VectorNavAscii
 from imu.protocols.vectornav_binary import VectorNavBinary
@@ -535,12 +536,15 @@ def test_the_speed_is_changed_when_nothing_is_understood_and_not_in_silence() ->
     for _ in range(12):
         assert detector.feed(b"") == []
         tried.append(detector.baud)
-        detector.feed(bytes([0x80, 0xF8, 0x00, 0x78, 0xC3]) * 900)
-    assert tried[:3] == [9600, 115200, 921600]
+        detector.feed(bytes([0x80, 0xF8, 0x00, 0x78, 0xC3]) * 103)
+    assert tried[:3] == [9600, 115200, 57600]
     assert tried[10] == 9600
     assert len(set(tried)) == 10
     assert "wrong baud rate" in detector.last_error
     assert detector.dropped == 12
+    text = Detector(baud=9600)
+    text.feed(b"hello\n" * 300)
+    assert text.baud == 9600, "text is listened to for longer"
     assert len(detector.feed(b"".join(wire("steadfix")))) == len(SAMPLES)
     assert detector.protocol == "steadfix"
     assert detector.baud == tried[11 - 10 + 1], "the speed at which it was understood stays"
@@ -575,3 +579,40 @@ def test_the_detector_says_what_its_parser_says() -> None:
 
 def test_every_name_opens_a_parser_of_its_own() -> None:
     assert len({type(open_parser(name)) for name in get_args(ProtocolName)}) == len(PROTOCOLS) + 1
+
+
+def test_without_pymavlink(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is an extra: everything else goes on, and what may be MAVLink is told what is missing."""
+    sent = b"".join(wire("mavlink"))
+    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
+    with pytest.raises(MavlinkMissingError, match="pip install pymavlink"):
+        open_parser("mavlink")
+    detector = Detector()
+    detector.feed(sent)
+    assert "MAVLink needs pymavlink" in detector.last_error
+    detector = Detector()
+    assert len(detector.feed(b"".join(wire("json")))) == len(SAMPLES)
+
+
+def test_a_known_protocol_without_readings_is_recognised_all_the_same() -> None:
+    """An autopilot that sends only heartbeats, and a sensor that is set to angles."""
+    from pymavlink.dialects.v20 import common
+
+    heartbeat = bytes(common.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(common.MAVLink(None)))
+    for sent, protocol in ((heartbeat, "mavlink"), (checked(b"VNYPR,1,2,3"), "vectornav")):
+        detector = Detector(baud=57600)
+        assert detector.feed(sent * 300) == []
+        assert (detector.protocol, detector.baud) == (protocol, 57600)
+
+
+def test_what_a_short_file_holds() -> None:
+    detector = Detector()
+    assert detector.feed(b"".join(wire("witmotion")[:2])) == []
+    assert len(detector.settle()) == 2
+    assert detector.protocol == "witmotion"
+    assert detector.settle() == []
+    detector = Detector()
+    detector.feed(b"half\nhello\nhel")
+    assert detector.settle() == []
+    assert "such as 'hello'" in detector.last_error
+    assert "baud)" not in detector.last_error

@@ -160,10 +160,19 @@ def test_a_given_protocol_and_what_it_does_not_understand(device: Device) -> Non
 
 
 def test_the_speed_is_searched(device: Device) -> None:
-    content = b"\xf8\x00\x78\x80" * 1500 + wire("steadfix", still() * 5)
-    report = listened(device, content, lambda watch: watch.health.samples >= 100)
-    assert report["protocol"] == "steadfix"
-    assert report["baud"] == 921600
+    """Garbage until another speed is tried, as from a device at that."""
+    args = parsed(device.port)
+    watch = imu._Watch(args, True)
+    with contextlib.closing(imu._port(watch, args)) as times:
+        next(times)
+        device.send(b"\xf8\x00\x78\x80" * 200)
+        next(time for time in times if watch.baud != 115200)
+        device.send(wire("steadfix", still()))
+        next(time for time in times if watch.health.samples == 300)
+    report = watch.report()
+    assert (report["protocol"], report["baud"]) == ("steadfix", 9600)
+    assert watch.port is not None
+    assert watch.port.baud == 9600
 
 
 def test_g_on_a_port_is_said(device: Device) -> None:
