@@ -143,7 +143,8 @@ def advice(
     `asked_rate_hz`: 0 where nothing was asked for.
     """
     texts = {}
-    if (still := edges.still_px()) > FOCUS_LIMIT_PX:
+    # In the dark the noise is what makes edges wide.
+    if (still := edges.still_px()) > FOCUS_LIMIT_PX and not delivery.white < DARK:
         texts["focus"] = f"edges at rest are {still:.1f} px wide (sigma): is the lens out of focus, or dirty?"
     if math.isnan(delivery.exposure) and (motion := edges.motion_px()) > BLUR_LIMIT_PX:
         texts["blur"] = (

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from imu.protocols import TIME_LIMIT
-from server.messages import ClockAnswer, ClockQuestion, Error, MessageError
+from server.messages import ClockAnswer, ClockQuestion, Error, MessageError, Notice
 
 # px; no camera is larger.
 _Pixel = Annotated[float, Meta(ge=-100_000.0, le=100_000.0)]
@@ -95,7 +95,7 @@ class NodeStatus(Struct, frozen=True, tag_field="type", tag="status"):
 
 
 FromNode = CameraHello | FrameSeen | NodeStatus | ClockAnswer
-ToNode = CameraWelcome | MarkerSizes | ClockQuestion | Error
+ToNode = CameraWelcome | MarkerSizes | ClockQuestion | Notice | Error
 
 encode = msgspec.json.Encoder().encode
 _from_node: msgspec.json.Decoder[FromNode] = msgspec.json.Decoder(FromNode)

@@ -36,7 +36,7 @@ from server.camera_messages import (
     encode,
     to_node,
 )
-from server.messages import ClockAnswer, ClockQuestion, Error, MessageError
+from server.messages import ClockAnswer, ClockQuestion, Error, MessageError, Notice
 from server.terminal import log_to_stderr, until_stopped
 
 log = logging.getLogger("steadfix.camera")
@@ -345,6 +345,8 @@ class Node:
                     await connection.send(encode(ClockAnswer(id, received, self._clock())), text=True)
                 case MarkerSizes(shortest_px, longest_px) if self._watch is not None:
                     self._watch.sizes_px(shortest_px, math.inf if longest_px is None else longest_px)
+                case Notice(text=text):
+                    log.info("the service says: %s", text)
                 case Error(reason=reason) if reason != said:
                     said = reason
                     log.warning("the service says: %s", reason)

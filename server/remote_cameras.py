@@ -34,7 +34,7 @@ from server.camera_messages import (
 )
 from server.cameras import Camera, Seen, SightedFrame
 from server.config import CameraConfig, Config
-from server.messages import ClockAnswer, ClockQuestion, MessageError
+from server.messages import ClockAnswer, ClockQuestion, MessageError, Notice
 
 log = logging.getLogger("steadfix.camera")
 
@@ -246,6 +246,14 @@ class RemoteCamera(Camera):
     def delivery(self, now: float) -> Delivery | None:
         """As its node measured it."""
         return self._delivery
+
+    def news(self, now: float) -> list[str]:
+        """As in Camera; said to the node as well, where someone may be on the ladder."""
+        news = super().news(now)
+        if self._connection is not None:
+            for text in news:
+                broadcast([self._connection], encode(Notice(text)), text=True)
+        return news
 
     def health(self, now: float) -> dict[str, Any]:
         delay = self.clock.minimum_delay

@@ -68,6 +68,7 @@ def test_a_lens_out_of_focus_is_told():
     (text,) = told(GOOD, edges=seen_edges(2.5, 0.0))
     assert text.startswith("edges at rest are 1.")
     assert text.endswith("px wide (sigma): is the lens out of focus, or dirty?")
+    assert all("focus" not in text for text in told(with_(white=20.0), edges=seen_edges(2.5, 0.0)))
 
 
 def test_a_few_edges_are_not_enough_and_old_ones_are_forgotten():

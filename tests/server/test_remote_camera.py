@@ -170,6 +170,7 @@ def test_what_the_picture_lacks_is_said(room: Config, picture: Any) -> None:
             assert (await health(service))["cameras"]["ceiling"]["advice"] == expected
             assert camera.news(100.0) == expected
             assert camera.news(105.0) == [], "once is enough"
+            assert [(await heard(connection, "notice"))["text"] for _ in expected] == expected
             await connection.send(status(white=2.0, exposure=None))
             await until(lambda: camera.delivery(0.0).white == 2.0)  # type: ignore[union-attr]
             state = (await health(service))["cameras"]["ceiling"]
