@@ -251,7 +251,9 @@ def calibrate(board: Board, views: Sequence[BoardView]) -> Calibration:
     Raises CalibrationError, which names the view, if they are of several image sizes, too few or without a solution.
     """
     if len(views) < SOLVABLE_VIEWS:
-        raise CalibrationError(f"{len(views)} views of the board: at least {SOLVABLE_VIEWS} are needed to solve at all")
+        raise CalibrationError(
+            f"too few views of the board: {len(views)}, and at least {SOLVABLE_VIEWS} are needed to solve at all"
+        )
     width, height = views[0].width_px, views[0].height_px
     for view in views:
         if (view.width_px, view.height_px) != (width, height):
@@ -421,7 +423,13 @@ def judge(views: Sequence[BoardView], calibration: Calibration | None) -> tuple[
     corners = [(row, column) for row in (0, -1) for column in (0, -1)]
     unseen = [place_in_words(r % CELLS, c % CELLS) for r, c in corners if not seen[r, c]]
     criteria = [
-        _count("views", len(views), LEAST_VIEWS, f"{len(views)} views", "take {} more, each with the board elsewhere"),
+        _count(
+            "views",
+            len(views),
+            LEAST_VIEWS,
+            f"{len(views)} views of the board",
+            "take {} more, each with the board elsewhere",
+        ),
         _count(
             "coverage",
             cells,

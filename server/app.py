@@ -9,9 +9,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
-import errno
 import functools
-import http
 import itertools
 import logging
 import math
@@ -21,7 +19,6 @@ import time
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from email.utils import formatdate
 from importlib.metadata import version
 from importlib.resources import files
 from types import TracebackType
@@ -46,6 +43,7 @@ from server.camera_messages import camera_hello
 from server.cameras import FIRST_PAUSE, LONGEST_PAUSE, Camera, Open, Seen, open_configured
 from server.config import CameraConfig, Config
 from server.hub import STALL_LIMIT, Hub, Subscription
+from server.listening import cannot_listen, response
 from server.messages import (
     FORMATS,
     ClockAnswer,
@@ -229,7 +227,7 @@ class Service:
                 server_header=None,
             )
         except OSError as error:
-            raise _words(error, host, port) from None
+            raise cannot_listen(error, host, port) from None
         self.port = self._server.sockets[0].getsockname()[1]
         if not is_loopback(host):
             self._say_who_is_let_in(host)
@@ -528,9 +526,9 @@ class Service:
         if path == "/healthz":
             if not local and not self._is_viewer(bearer(headers)):
                 return self._locked(request)
-            return _response(200, msgspec.json.encode(self.health()) + b"\n", "application/json", request)
+            return response(200, msgspec.json.encode(self.health()) + b"\n", "application/json", request)
         if path in self._page:
-            return _response(200, *self._page[path], request)
+            return response(200, *self._page[path], request)
         if path in _WEBSOCKETS:
             return _text(426, f"{path} is a WebSocket.\n{_THERE_IS}", request)
         return _text(404, f"Nothing at {path}\n{_THERE_IS}", request)
@@ -834,30 +832,4 @@ def _address(connection: ServerConnection) -> str:
 
 
 def _text(status: int, text: str, request: Request) -> Response:
-    return _response(status, text.encode(), "text/plain; charset=utf-8", request)
-
-
-def _response(status: int, body: bytes, kind: str, request: Request) -> Response:
-    headers = Headers(
-        {
-            "Date": formatdate(usegmt=True),
-            "Connection": "close",
-            "Content-Type": kind,
-            "Content-Length": str(len(body)),
-            "Cache-Control": "no-cache",
-            "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws: wss:",
-            "X-Content-Type-Options": "nosniff",
-        }
-    )
-    status_line = http.HTTPStatus(status)
-    return Response(status_line.value, status_line.phrase, headers, b"" if request.method == "HEAD" else body)
-
-
-def _words(error: OSError, host: str, port: int) -> OSError:
-    if error.errno == errno.EADDRINUSE:
-        what = f"port {port} on {host} is in use: is another Steadfix running? `--port` takes another, 0 any free one"
-    elif error.errno == errno.EACCES:
-        what = f"port {port} on {host} is not allowed: ports below 1024 need rights; `--port` takes another"
-    else:
-        what = f"cannot listen on {host}, port {port}: {error.strerror or error}"
-    return OSError(error.errno or errno.EIO, what)
+    return response(status, text.encode(), "text/plain; charset=utf-8", request)

@@ -21,6 +21,7 @@ from camera.capture import IMAGE_SUFFIXES, FrameSource, open_source, read_image
 from camera.guide import Guide, Step
 from camera.markers import Pixels, grey
 from server.calibration_page import CalibrationPage
+from server.listening import is_local, port_number, reachable
 
 DEFAULT_PORT = 5679
 # s without a frame after which a camera counts as lost; s before it is tried again, doubled up to the longest.
@@ -39,11 +40,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE",
         help='a live camera instead, guided: 0, "/dev/video2", "rtsp://...", "picamera", or a video or folder as one',
     )
-    parser.add_argument("--width-px", type=int, default=0, metavar="W", help="asked of the live camera")
-    parser.add_argument("--height-px", type=int, default=0, metavar="H", help="asked of the live camera")
+    parser.add_argument("--width-px", type=_pixels, default=0, metavar="W", help="asked of the live camera")
+    parser.add_argument("--height-px", type=_pixels, default=0, metavar="H", help="asked of the live camera")
     parser.add_argument("--host", default="127.0.0.1", help="address of the guiding page (default: %(default)s)")
     parser.add_argument(
-        "--port", type=int, default=DEFAULT_PORT, help="its port, 0 for any free one (default: %(default)s)"
+        "--port", type=port_number, default=DEFAULT_PORT, help="its port, 0 for any free one (default: %(default)s)"
     )
     parser.add_argument(
         "--board",
@@ -55,6 +56,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="CAMERA.toml", help="the calibration file to write")
     parser.add_argument("--force", action="store_true", help="write it even where it is not good enough")
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+
+
+def _pixels(text: str) -> int:
+    if not (text.isdecimal() and text.isascii() and 0 < int(text) <= 20000):
+        raise argparse.ArgumentTypeError(f"{text!r}: a whole number of pixels is needed")
+    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -111,7 +118,7 @@ def _views(files: Iterator[Path], detector: BoardDetector) -> tuple[list[BoardVi
             _say(f"{path}: left out, the board is where it is in {same.name}")
         else:
             views.append(view)
-    _say(f"the board is in {len(views)} of {count} pictures")
+    _say(f"the board is in {len(views)} of {count} picture{'s' * (count != 1)}")
     return views, failed
 
 
@@ -132,8 +139,10 @@ class _Guided:
         source: FrameSource | None = await asyncio.to_thread(self._open)
         pause = FIRST_PAUSE
         async with CalibrationPage(self._args.host, self._args.port) as page:
-            _say(f"http://{self._args.host}:{page.port}/ shows the picture and what to do; so do these lines")
-            if self._args.host not in ("127.0.0.1", "localhost", "::1"):
+            _say(
+                f"http://{reachable(self._args.host)}:{page.port}/ shows the picture and what to do; so do these lines"
+            )
+            if not is_local(self._args.host):
                 _say("anyone on this network can see the picture")
             try:
                 while not self.guide.done:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import http
-from email.utils import formatdate
 from importlib.resources import files
 from types import TracebackType
 from typing import Any, Self
@@ -13,9 +11,10 @@ from urllib.parse import urlsplit
 
 import msgspec
 from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
+
+from server.listening import cannot_listen, response
 
 _WEBSOCKET = "/v1/calibration"
 _PAGE = {
@@ -33,7 +32,7 @@ class CalibrationPage:
     """`async with CalibrationPage(host, port) as page:` serves it on `page.port`; `page.show(...)` sends each viewer
     the newest state, and the picture that belongs to it. A slow viewer skips states.
 
-    Raises OSError when the port cannot be had.
+    Raises OSError in words when the port cannot be had.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -53,15 +52,18 @@ class CalibrationPage:
         self._server: Server | None = None
 
     async def __aenter__(self) -> Self:
-        self._server = await serve(
-            self._serve,
-            self._host,
-            self.port,
-            process_request=self._answer,
-            compression=None,
-            max_size=1024,
-            server_header=None,
-        )
+        try:
+            self._server = await serve(
+                self._serve,
+                self._host,
+                self.port,
+                process_request=self._answer,
+                compression=None,
+                max_size=1024,
+                server_header=None,
+            )
+        except OSError as error:
+            raise cannot_listen(error, self._host, self.port) from None
         self.port = self._server.sockets[0].getsockname()[1]
         return self
 
@@ -116,23 +118,7 @@ class CalibrationPage:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         path = urlsplit(request.path).path
         if request.headers.get("Upgrade", "").lower() == "websocket":
-            return None if path == _WEBSOCKET else _response(404, b"", "text/plain", request)
+            return None if path == _WEBSOCKET else response(404, b"", "text/plain", request)
         if path in self._files:
-            return _response(200, *self._files[path], request)
-        return _response(404, b"The page is at /\n", "text/plain; charset=utf-8", request)
-
-
-def _response(status: int, body: bytes, kind: str, request: Request) -> Response:
-    headers = Headers(
-        {
-            "Date": formatdate(usegmt=True),
-            "Connection": "close",
-            "Content-Type": kind,
-            "Content-Length": str(len(body)),
-            "Cache-Control": "no-cache",
-            "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws: wss:",
-            "X-Content-Type-Options": "nosniff",
-        }
-    )
-    status_line = http.HTTPStatus(status)
-    return Response(status_line.value, status_line.phrase, headers, b"" if request.method == "HEAD" else body)
+            return response(200, *self._files[path], request)
+        return response(404, b"The page is at /\n", "text/plain; charset=utf-8", request)

@@ -13,6 +13,7 @@ import msgspec
 from server.app import SERVICE, Service
 from server.config import Config, ConfigError, load
 from server.demo.room import DemoRoom
+from server.listening import port_number, reachable
 from server.recording import Recorder
 from server.terminal import log_to_stderr, stop_signals
 
@@ -22,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", help="address to listen on, instead of the configured one")
     parser.add_argument(
         "--port",
-        type=_port,
+        type=port_number,
         metavar="PORT",
         help="port to listen on, instead of the configured one; 0 for any free one",
     )
@@ -31,12 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--light", type=_light, metavar="L", help="of the simulated room: 1 is well lit, 0.1 is dusk")
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="keep all inputs there, for `steadfix replay`")
-
-
-def _port(text: str) -> int:
-    if not (text.isdecimal() and text.isascii() and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"{text!r} is no port, 0 to 65535 are")
-    return int(text)
 
 
 def _light(text: str) -> float:
@@ -90,7 +85,7 @@ async def _serve_until(
             room.record_truth = recorder.truth if recorder is not None else None
             service = Service(config, recorder, room.open_camera, room.score)
         await stack.enter_async_context(service)
-        address = f"{_reachable(config.server.host)}:{service.port}"
+        address = f"{reachable(config.server.host)}:{service.port}"
         if room is not None:
             room.start(f"ws://{address}")
         scheme = "https" if config.server.certificate else "http"
@@ -100,10 +95,3 @@ async def _serve_until(
         stopped.cancel()
         if service.failed.done():
             service.failed.result()
-
-
-def _reachable(host: str) -> str:
-    """The host to put into an address on this machine."""
-    if host in ("", "0.0.0.0", "::"):
-        return "127.0.0.1"
-    return f"[{host}]" if ":" in host else host

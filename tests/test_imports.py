@@ -23,6 +23,7 @@ DOORS = {
     "serial": {"imu/uart.py"},
     "pymavlink": {"imu/protocols/mavlink.py"},
     "websockets": {
+        "server/listening.py",
         "server/calibration_page.py",
         "server/app.py",
         "server/robot_client.py",
@@ -31,7 +32,7 @@ DOORS = {
     },
     "filterpy": {"fusion/reference.py"},
     "allantools": {"imu/allan.py"},
-    "numba": {"fusion/kernels.py", "camera/edges.py"},
+    "numba": {"fusion/kernels.py", "camera/edges.py", "camera/planar.py"},
 }
 # `fusion` is pure: time and data are arguments, and it returns instead of saying anything.
 IMPURE = {"asyncio", "logging", "os", "pathlib", "socket", "subprocess", "threading", "time", "datetime"}

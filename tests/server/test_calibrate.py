@@ -95,7 +95,7 @@ def test_eight_frontal_pictures_are_refused(capfd: pytest.CaptureFixture[str], s
         cv2.imwrite(str(tmp_path / f"{k}.png"), studio.picture(pose))
     status, text, err = steadfix(capfd, tmp_path, "--out", tmp_path / "camera.toml")
     assert status == 1
-    assert "MISSING  8 views: take 12 more" in text
+    assert "MISSING  8 views of the board: take 12 more" in text
     assert "MISSING  0 views tilted by 20 to 45 deg: tilt the board by about 30 deg" in text
     assert "is not written" in err
     assert not (tmp_path / "camera.toml").exists()
@@ -138,7 +138,7 @@ def test_another_image_size_and_another_board(
     status, text, err = steadfix(capfd, pictures / "00.png", "--board", "charuco:8x6:30mm:21mm:4X4_50", "--out", out)
     assert (status, text) == (1, "")
     assert "it shows markers of 5X5_250" in err
-    assert "0 views of the board: at least 4 are needed" in err
+    assert "too few views of the board: 0, and at least 4 are needed" in err
     assert not out.exists()
 
 
