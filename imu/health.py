@@ -63,8 +63,8 @@ GAPS_LEAST, GAPS_SHARE = 3, 0.01
 DROPPED_LEAST, DROPPED_SHARE = 3, 0.01  # lines or frames, and their share, unless it is most of them
 CLOCK_SPAN, CLOCK_SHARE = 2.0, 0.05  # s, share: by how much the device's clock may be fast
 CLOCK_UNITS = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
-# s between the arrivals of batches that are said, and those that are an FTDI's latency timer.
-BATCH_LEAST, LATENCY_TIMER = 0.012, (0.012, 0.020)
+# s between the arrivals of batches that are those of an FTDI's latency timer; others are as the device makes them.
+LATENCY_TIMER = (0.012, 0.020)
 
 
 class Finding(NamedTuple):
@@ -242,16 +242,13 @@ class StreamHealth:
         if not self.port or len(intervals) < LEAST or not step > 0.0:
             return
         interval = float(np.median(intervals))
-        if interval < BATCH_LEAST or interval < 2.0 * step:
+        if not LATENCY_TIMER[0] <= interval <= LATENCY_TIMER[1] or interval < 2.0 * step:
             return
-        ms = 1e3 * interval
-        text = f"samples come in batches of {ms:.0f} ms"
-        if LATENCY_TIMER[0] <= interval <= LATENCY_TIMER[1]:
-            name = self.port.rpartition("/")[2]
-            text += (
-                ": set the latency timer of the USB adapter to 1, on Linux by "
-                f"`echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer`"
-            )
+        ms, name = 1e3 * interval, self.port.rpartition("/")[2]
+        text = (
+            f"samples come in batches of {ms:.0f} ms: set the latency timer of the USB adapter to 1, on Linux by "
+            f"`echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer`"
+        )
         yield Finding("imu_batches", "note", text, {"interval_ms": ms, "samples": interval / step})
 
 
