@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from fusion.measurements import Array
-from imu.calibration import CalibrationError, check_gravity, rests
+from imu.calibration import CalibrationError, check_gravity, longest_rest
 
 # Sensors: name, columns of readings, unit.
 SENSORS = (("gyro", slice(1, 4), "rad/s"), ("accel", slice(4, 7), "m/s2"))
@@ -55,8 +55,7 @@ class Allan(NamedTuple):
 
 def analyse(readings: Array) -> Allan:
     """Readings (n, 7) as in `imu.calibration`. Raises CalibrationError where they hold no rest that is long enough."""
-    longest = max(rests(readings), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 0))
-    part = readings[longest]
+    part = readings[longest_rest(readings)]
     seconds = float(part[-1, 0] - part[0, 0]) if len(part) else 0.0
     if seconds < SHORTEST:
         raise CalibrationError(

@@ -101,21 +101,32 @@ def rests(readings: Array) -> list[slice]:
     return stretches
 
 
+def longest_rest(readings: Array) -> slice:
+    """Of `rests`; empty where there is none."""
+    return max(rests(readings), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 0))
+
+
 def _duration(readings: Array, stretch: slice) -> float:
     return float((stretch.stop - stretch.start) / rate_of(readings))
 
 
 def at_rest(readings: Array, seconds: float = 10.0) -> Rest:
     """The longest rest in readings (n, 7). Raises CalibrationError if it is under `seconds`, or its gravity is none."""
-    stretches = rests(readings)
-    longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 0))
+    longest = longest_rest(readings)
     duration = _duration(readings, longest)
-    if duration < seconds - 0.5 * WINDOW:
+    # Windows are whole ones: up to one is lost at the end.
+    if duration < max(seconds - 1.1 * WINDOW, 0.5 * WINDOW):
         span = len(readings) / rate_of(readings)
         if span < seconds:
             raise CalibrationError(f"{span:.1f} s of readings; {seconds:g} s at rest are needed")
-        best = f"it was still for {duration:.0f} s at most" if stretches else "it was never still"
-        raise CalibrationError(f"the IMU moved: {best}, {seconds:g} s are needed; stand it on something firm")
+        # In a wrong unit rest looks like motion.
+        check_gravity(float(np.median(np.linalg.norm(readings[:, 4:], axis=1))))
+        best = (
+            f"it was still for {duration:.0f} s at most"
+            if duration
+            else "it was never still, or its rates are not rad/s"
+        )
+        raise CalibrationError(f"the IMU moved: {best}; {seconds:g} s are needed, on something firm")
     part = readings[longest]
     mean, scatter = part[:, 1:].mean(axis=0), part[:, 1:].std(axis=0)
     check_gravity(float(np.linalg.norm(mean[3:])))

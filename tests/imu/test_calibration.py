@@ -52,6 +52,14 @@ def test_rest_gives_bias_scatter_and_mounting() -> None:
     assert mounted @ rest.force == pytest.approx([0.0, 0.0, GRAVITY], abs=0.01)
 
 
+@pytest.mark.parametrize("rate", [10.0, 99.2, 285.7, 1000.0])
+def test_ten_seconds_are_enough_at_any_rate(rate: float) -> None:
+    n = int(10.0 * rate) + 1
+    lying = readings([still(n / RATE)])
+    lying[:, 0] = np.arange(n) / rate
+    assert at_rest(lying).rate_hz == pytest.approx(rate)
+
+
 def test_an_imu_upside_down() -> None:
     rest = at_rest(readings([still(12.0, force=np.array([0.0, 0.0, -GRAVITY]))]))
     assert np.abs(rest.rotation_deg) == pytest.approx([180.0, 0.0, 0.0], abs=0.05)
@@ -60,7 +68,7 @@ def test_an_imu_upside_down() -> None:
 @pytest.mark.parametrize(
     ("parts", "said"),
     [
-        ([still(5.0), moving(1.0), still(6.0)], "it was still for 6 s at most, 10 s are needed"),
+        ([still(5.0), moving(1.0), still(6.0)], "it was still for 6 s at most; 10 s are needed"),
         ([moving(12.0)], "it was never still"),
         ([still(3.0)], "3.0 s of readings; 10 s at rest are needed"),
         ([still(12.0, (0.5, 0.0, 0.0))], "never still"),
@@ -68,6 +76,11 @@ def test_an_imu_upside_down() -> None:
         ([still(6.0), still(6.0, (0.02, 0.0, 0.0))], "still for 6 s at most"),
         ([still(12.0, force=np.array([0.0, 0.0, 1.0]))], "gravity reads 1 instead of 9.81 m/s2: these are g"),
         ([still(12.0, force=np.array([0.0, 1000.0, 0.0]))], "these are thousandths of g"),
+        ([(12.0, np.zeros(3), np.array([0.0, 0.0, 16384.0]), 0.002, 50.0)], "these are raw counts"),
+        (
+            [(12.0, np.full(3, 0.4), np.array([0.0, 0.0, GRAVITY]), 0.1, 0.03)],
+            "never still, or its rates are not rad/s",
+        ),
         ([still(12.0, force=np.array([0.0, 0.0, 5.0]))], "the unit or the scale is wrong"),
     ],
 )
