@@ -10,12 +10,14 @@ import os
 import socket
 import time
 import tty
+from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from camera.calibration import CalibrationError, Intrinsics, save_intrinsics
@@ -702,5 +704,99 @@ def test_a_serial_port_that_is_not_there() -> None:
         async with serving(config) as service:
             await until(lambda: "/dev/nothing" in service.robots["cart"].trouble)
             assert "is the device plugged in?" in service.robots["cart"].trouble
+
+    run(main)
+
+
+# Data that look wrong
+
+
+@contextlib.asynccontextmanager
+async def sending(connection: ClientConnection, reading: list[float]) -> AsyncIterator[None]:
+    """One reading again and again, with some noise, at 200 Hz."""
+
+    async def send() -> None:
+        noise = np.random.default_rng(2)
+        while True:
+            await asyncio.sleep(0.05)  # the pace of this robot
+            rows = np.tile(reading, (10, 1)) * noise.normal(1.0, 1e-3, (10, 6))
+            stamps = time.monotonic() - 0.005 * np.arange(10)[::-1]
+            await connection.send(json.dumps({"type": "imu", "samples": np.column_stack([stamps, rows]).tolist()}))
+
+    task = asyncio.create_task(send())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def test_g_that_were_not_declared_are_noticed_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.app.DIAGNOSE_EVERY", 0.1)
+
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            await hello(connection)
+            async with sending(connection, [0.01, 0.01, 0.01, 0.02, 0.01, 1.0]):
+                while "these are g" not in (said := (await heard(connection, "notice"))["text"]):
+                    pass
+            assert any(said in reason for reason in (await health(service))["reasons"])
+
+    run(main)
+
+
+def test_g_and_degrees_that_were_declared_are_converted() -> None:
+    async def main() -> None:
+        recording = Recording()
+        async with serving(recording=recording) as service, client(service, "/v1/robot") as connection:
+            units = {"gyro": "deg/s", "accel": "g"}
+            await connection.send(json.dumps({"type": "hello", "robot": "rover", "units": units}))
+            await heard(connection, "welcome")
+            await connection.send('{"type":"imu","samples":[[5.0,90,-90,720,0.5,0,1]]}')
+            await until(lambda: len(recording.batches) == 1)
+            expected = [math.pi / 2, -math.pi / 2, 4 * math.pi, 4.903325, 0.0, 9.80665]
+            assert recording.batches[0].samples[0, 1:] == pytest.approx(expected)
+            assert service.refused == 0
+
+    run(main)
+
+
+@pytest.mark.parametrize("offset", [365 * 86400.0, -365 * 86400.0])
+def test_stamps_a_year_off_are_said_and_survived(offset: float) -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            await hello(connection)
+            rover = service.robots["rover"]
+            for shift, samples in ((0.0, 10), (offset, 20), (0.0, 30)):
+                await connection.send(imu(time.monotonic() + shift))
+                await until(lambda samples=samples: rover.localiser.counts["imu_samples"] == samples)
+            assert "its clock has jumped or started anew" in (await heard(connection, "notice"))["text"]
+            assert (await health(service))["robots"]["rover"]["clock_restarts"] > 0
+            rover.feed_fix(fix(), time.monotonic())
+            pose = rover.publish(time.monotonic())
+            assert pose is not None
+            assert pose.position == pytest.approx([1.0, 2.0, 0.0], abs=0.1)
+
+    run(main)
+
+
+def test_a_robot_that_comes_back_at_another_rate_misses_no_samples() -> None:
+    async def main() -> None:
+        async with serving() as service:
+            robot = service.robots["rover"]
+            noise = np.random.default_rng(3)
+            now = time.monotonic()
+            for rate_hz in (200.0, 50.0):
+                robot.connected()
+                for _ in range(60):
+                    stamps = now + np.arange(1, round(rate_hz / 2) + 1) / rate_hz
+                    readings = noise.normal([0.0, 0.0, 0.0, 0.0, 0.0, 9.80665], 1e-2, (len(stamps), 6))
+                    rows = [(t, *reading) for t, reading in zip(stamps.tolist(), readings.tolist(), strict=True)]
+                    now = stamps[-1]
+                    robot.feed_imu(rows, now, now)
+                # And nobody was there meanwhile.
+                assert not [text for text in robot.diagnose(now) if "missing" in text]
+                now += 20.0
 
     run(main)
