@@ -7,7 +7,6 @@ name and the address of the service, and all else that it needs to know comes wi
 from __future__ import annotations
 
 import asyncio
-import itertools
 import logging
 import math
 import threading
@@ -22,7 +21,6 @@ from camera.calibration import CalibrationError
 from camera.exposure import Delivery
 from camera.markers import MarkerSighting
 from imu.clock import DeviceClock
-from imu.protocols import TIME_LIMIT
 from server.camera_messages import (
     CameraHello,
     CameraWelcome,
@@ -33,13 +31,12 @@ from server.camera_messages import (
     from_node,
 )
 from server.cameras import Camera, Seen, SightedFrame
+from server.clock_questions import ClockQuestions
 from server.config import CameraConfig, Config
-from server.messages import ClockAnswer, ClockQuestion, MessageError, Notice
+from server.messages import ClockAnswer, MessageError, Notice
 
 log = logging.getLogger("steadfix.camera")
 
-# s between clock questions, for the first ones and then.
-CLOCK_FAST, CLOCK_FAST_COUNT, CLOCK_SLOW = 0.1, 10, 1.0
 # s without a word after which a node counts as gone, and another connection of it may take its place.
 SILENCE = 3.0
 
@@ -146,7 +143,7 @@ class RemoteCamera(Camera):
             gain=config.gain,
             line_time=config.line_time,
         )
-        questions: dict[int, float] = {}
+        questions = ClockQuestions()
         tending = None
         try:
             await connection.send(encode(welcome), text=True)
@@ -172,17 +169,14 @@ class RemoteCamera(Camera):
             self.status = status
             log.info("camera %s: %s", self.config.name, status)
 
-    async def _tend(self, connection: ServerConnection, questions: dict[int, float]) -> None:
+    async def _tend(self, connection: ServerConnection, questions: ClockQuestions) -> None:
         """Ask for the node's clock, tell it what is found out about its camera, and miss it when it is silent."""
         told = None
-        for id in itertools.count():
-            while len(questions) >= CLOCK_FAST_COUNT:
-                del questions[next(iter(questions))]
+        while True:
             now = time.monotonic()
             # A question that waits behind others would measure those.
             if connection.transport.get_write_buffer_size() == 0:
-                questions[id] = now
-                broadcast([connection], encode(ClockQuestion(id, now)), text=True)
+                broadcast([connection], encode(questions.ask(now)), text=True)
             if self.frames and (placement := self.placement) is not None and placement is not told:
                 told = placement
                 shortest, longest = self._sides_px(placement)
@@ -190,9 +184,9 @@ class RemoteCamera(Camera):
                 broadcast([connection], encode(sizes), text=True)
             if now - self._heard >= SILENCE and self._connection is connection:
                 self._say(f"its node ({self.node}) says nothing any more; waiting for it")
-            await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
+            await asyncio.sleep(questions.pause)
 
-    def _hear(self, questions: dict[int, float], data: str | bytes, arrival: float) -> None:
+    def _hear(self, questions: ClockQuestions, data: str | bytes, arrival: float) -> None:
         match from_node(data):
             case FrameSeen() as seen:
                 self.clock.observe(seen.sent, arrival)
@@ -200,12 +194,7 @@ class RemoteCamera(Camera):
                 if self.clock.minimum_delay is not None:
                     self._frames.put(self._frame(seen))
             case ClockAnswer(id, received, sent):
-                asked = questions.pop(id, None)
-                if asked is None:
-                    raise MessageError(f"a clock answer with id {id}, which was not asked")
-                if not max(abs(received), abs(sent)) < TIME_LIMIT:
-                    raise MessageError(f"a clock that reads {max(received, sent)}; seconds are needed")
-                self.clock.exchange(asked, received, sent, arrival)
+                questions.take(id, received, sent, arrival, self.clock)
             case NodeStatus() as status:
                 known = (math.nan if x is None else x for x in (status.exposure, status.white, status.saturated))
                 self._delivery = Delivery(status.rate_hz, status.used_hz, *known)
@@ -217,8 +206,11 @@ class RemoteCamera(Camera):
                 raise MessageError("a second hello")
 
     def _frame(self, seen: FrameSeen) -> SightedFrame:
-        if unknown := {marker.id for marker in seen.markers} - self.ids:
-            raise MessageError(f"markers that were not asked for: {sorted(unknown)}")
+        ids = sorted(marker.id for marker in seen.markers)
+        if not self.ids.issuperset(ids):
+            raise MessageError(f"markers that were not asked for: {sorted(set(ids) - self.ids)}")
+        if len(set(ids)) < len(ids):
+            raise MessageError(f"a marker twice, in {ids}: which one is meant?")
         if not seen.t <= seen.sent:
             raise MessageError(f"a frame of {seen.t - seen.sent:.3g} s after it was sent")
         try:

@@ -196,6 +196,7 @@ def test_what_a_node_must_not_send(room: Config) -> None:
                 ('{"type":"hello","camera":"ceiling"}', "a second hello"),
                 ('{"type":"clock","id":99,"received":1.0,"sent":1.0}', "was not asked"),
                 (frame(now, 1, [marker | {"id": 9}]), "not asked for: [9]"),
+                (frame(now, 1, [marker, marker]), "a marker twice, in [7, 7]"),
                 (frame(now, 1, [marker | {"corners_px": corners[:3]}]), "corners_px"),
                 (frame(now, 1, [marker | {"sigma_px": 0.0}]), "sigma_px"),
                 (frame(now, 1, [marker | {"corners_px": [[1e300, 1.0], *corners[1:]]}]), "corners_px"),
