@@ -19,8 +19,8 @@ from tqdm import tqdm
 from fusion.geometry import exp_so3, rotation_about_z
 from fusion.localiser import Localiser, warm_up
 from fusion.measurements import Array
-from fusion.params import FilterParams
-from imu.calibration import CalibrationError
+from fusion.params import GRAVITY, FilterParams
+from imu.calibration import CalibrationError, check_gravity
 from imu.mounting import BodyReadings, ImuCalibration, deg_from_rotation, rotation_from_deg, toml_lines
 from server.recording import Recording, load, load_calibration, robot_folders
 from server.replay import replay
@@ -81,6 +81,9 @@ def find(raw: Recording, known: ImuCalibration, progress: Callable[[], object]) 
             )
         return np.clip(np.nan_to_num(y), -MOST_SIGMAS, MOST_SIGMAS), float(np.mean(d2))
 
+    norm = float(np.median(np.linalg.norm(raw.samples[:, 4:], axis=1)))
+    if not 0.5 * GRAVITY < norm < 2.0 * GRAVITY:
+        check_gravity(norm)
     # Upright on the mean, as it drives; then all round.
     up = np.median(raw.samples[:, 4:], axis=0)
     upright = Rotation.align_vectors(np.array([[0.0, 0.0, 1.0]]), up[np.newaxis])[0].as_matrix()

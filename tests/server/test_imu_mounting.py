@@ -10,6 +10,7 @@ import pytest
 
 from fusion.geometry import log_so3
 from fusion.measurements import Array, ImuBatch, PoseFix
+from fusion.params import GRAVITY
 from fusion.simulator import ImuParams, figure_eight, random_ground, simulate
 from imu.mounting import ImuCalibration, rotation_from_deg
 from server.cli import main
@@ -94,6 +95,8 @@ def test_axes_that_no_rotation_makes_right(tmp_path: Path, capsys: pytest.Captur
 def test_what_cannot_be_done_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     simulation = simulate(figure_eight(), 1, duration=30.0, robot="rover")
     few = write(tmp_path / "few", simulation.samples, simulation.fixes[:5])
+    none = simulation.samples * [1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    in_g = simulation.samples / [1.0, 1.0, 1.0, 1.0, *[GRAVITY] * 3]
     late = write(tmp_path / "late", simulation.samples + [1000.0, *[0.0] * 6], simulation.fixes)
     (tmp_path / "both").mkdir()
     for name in ("a", "b"):
@@ -103,6 +106,8 @@ def test_what_cannot_be_done_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     for folder, said in (
         (tmp_path / "none", "no such folder"),
         (few, "4 fixes that the IMU leads from one to the next; 20 are needed"),
+        (write(tmp_path / "g", in_g, simulation.fixes), "these are g"),
+        (write(tmp_path / "zero", none, simulation.fixes), "gravity reads 0 instead of 9.81"),
         (late, "the drive shows the rotation to 180 deg only"),
         (tmp_path / "both", "several robots; name one of "),
     ):
