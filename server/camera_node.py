@@ -258,7 +258,6 @@ class Node:
             self._watch = Watch(welcome, self._open, self._see, self._end)
         # Nobody needs what was seen before.
         self._latest = None
-        self._news.clear()
 
     async def _talk(self, connection: ClientConnection) -> None:
         """Send and receive, until the connection or the source is at its end."""
@@ -325,9 +324,7 @@ class Node:
     def _status(self, trouble: str) -> NodeStatus:
         assert self._watch is not None
         delivery = self._watch.meter.delivery(time.monotonic())
-        exposure, white, saturated = (
-            value if math.isfinite(value) else None for value in (delivery.exposure, delivery.white, delivery.saturated)
-        )
+        exposure, white, saturated = map(_known, (delivery.exposure, delivery.white, delivery.saturated))
         return NodeStatus(trouble, delivery.rate_hz, delivery.used_hz, exposure, white, saturated, self.dropped)
 
     async def _hear(self, connection: ClientConnection) -> None:
