@@ -24,7 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from camera import fix
+from camera import planar
 from camera.calibration import Intrinsics
 from camera.fix import Body, MarkerMount, marker_corners, predict, solve
 from camera.markers import Image
@@ -82,7 +82,7 @@ def places(random: np.random.Generator, count: int, uneven: bool = False) -> dic
         x, y = (id % columns - 0.5 * (columns - 1)) * 3.0 / columns, (id // columns - 0.5 * (rows - 1)) * 2.8 / rows
         z, tilt = 0.0, np.zeros(3)
         if uneven:
-            z, tilt[:2] = random.normal(0.0, fix.FLOOR_HEIGHT_SIGMA), random.normal(0.0, fix.FLOOR_TILT_SIGMA, 2)
+            z, tilt[:2] = random.normal(0.0, planar.FLOOR_HEIGHT_SIGMA), random.normal(0.0, planar.FLOOR_TILT_SIGMA, 2)
         R = rotation_about_z(random.uniform(-math.pi, math.pi)) @ exp_so3(tilt)
         poses[id] = transform(R, [x + random.uniform(-0.1, 0.1), y + random.uniform(-0.1, 0.1), z])
     return poses

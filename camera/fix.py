@@ -15,30 +15,21 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.calibration import Intrinsics
 from camera.markers import MarkerSighting
+from camera.planar import solve_planar
 from camera.tracking import Prediction
 from fusion.geometry import (
     exp_so3,
     inverse,
     quaternion_from_rotation,
     rotation_from_quaternion,
+    skew,
     transform,
     transform_points,
 )
 from fusion.measurements import Array, Pose, PoseFix, PoseHypothesis
-
-# What the planar solve takes as known is known this well: the height of the body above the floor, m, ...
-FLOOR_HEIGHT_SIGMA = 0.005
-# ... and its roll and pitch, rad. An uneven floor, a soft tyre, a marker glued on a little askew.
-FLOOR_TILT_SIGMA = 0.01
-
-_PLANAR = [0, 1, 5]
-_PLANAR_ROWS = [[0], [1], [5]]
-_ASSUMED = [2, 3, 4]
-_ASSUMED_COVARIANCE = np.diag([FLOOR_HEIGHT_SIGMA**2, FLOOR_TILT_SIGMA**2, FLOOR_TILT_SIGMA**2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +48,7 @@ Seen = tuple[MarkerMount, MarkerSighting]
 class Body:
     """A robot with its markers.
 
-    `planar`: it stands level on the floor (z = 0), known to FLOOR_HEIGHT_SIGMA and FLOOR_TILT_SIGMA, and the corners
+    `planar`: it stands level on the floor (z = 0), as `camera.planar` supposes it, and the corners
     tell x, y and yaw: far better determined than six unknowns, because a marker seen from straight above hardly shows
     its tilt. `corners`: (4, 3) m in the body's frame, by the marker's id.
     """
@@ -69,6 +60,8 @@ class Body:
         self.corners = {
             mount.id: transform_points(mount.body_from_marker, marker_corners(mount.size)) for mount in mounts
         }
+        # m from the body's origin to the corner that is furthest away
+        self.reach = {id: float(np.linalg.norm(corners, axis=1).max()) for id, corners in self.corners.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,30 +274,44 @@ def predict(
 
     The poses are for the exposure of the image's first row. `line_time`: s from one row's exposure to the next one's.
     """
-    known = [
-        (poses[body.name], id, points) for body in bodies if body.name in poses for id, points in body.corners.items()
-    ]
+    known: list[tuple[int, float]] = []
+    points, velocities = [], []
+    for body in bodies:
+        if (pose := poses.get(body.name)) is None:
+            continue
+        R = rotation_from_quaternion(pose.quaternion_wxyz)
+        variance = pose.covariance.diagonal().tolist()
+        for id, corners_body in body.corners.items():
+            lever = corners_body @ R.T
+            points.append(lever + pose.position)
+            if line_time:
+                velocities.append(pose.velocity + np.cross(R @ pose.angular_velocity, lever))
+            # m; a bound: the largest of each three, and the corner furthest away
+            known.append((id, math.sqrt(max(variance[:3])) + math.sqrt(max(variance[3:])) * body.reach[id]))
     if not known:
         return {}
-    position = np.array([pose.position for pose, _, _ in known])
-    R = np.array([rotation_from_quaternion(pose.quaternion_wxyz) for pose, _, _ in known])
-    # (m, 4, 3): a marker's corners from its body's origin, along the world's axes
-    lever = np.array([points for _, _, points in known]) @ R.transpose(0, 2, 1)
-    camera = world_from_camera[:3, 3]
-    in_camera = (lever + position[:, None] - camera) @ world_from_camera[:3, :3]
-    visible = in_camera[..., 2].min(axis=1) > 1e-3
-    pixels, by_point = project(np.where(visible[:, None, None], in_camera, [0.0, 0.0, 1.0]).reshape(-1, 3), intrinsics)
-    corners = pixels.reshape(-1, 4, 2)
-    by_position = (by_point @ world_from_camera[:3, :3].T).reshape(-1, 4, 2, 3)
-    by_pose = _by_pose(by_position, lever)
+    world = np.array(points)
+    corners, depth = _seen_at(world, intrinsics, world_from_camera)
     if line_time:
-        motion = np.array([[*pose.velocity, *(R[k] @ pose.angular_velocity)] for k, (pose, _, _) in enumerate(known)])
-        rows = corners[..., 1].mean(axis=1)
-        corners = corners + line_time * rows[:, None, None] * np.einsum("mcai,mi->mca", by_pose, motion)
-    covariance = np.array([pose.covariance for pose, _, _ in known])
-    variance = np.einsum("mcai,mij,mcaj->mca", by_pose, covariance, by_pose)
-    sigma = np.sqrt(variance.max(axis=(1, 2)))
-    return {id: Prediction(corners[k], float(sigma[k])) for k, (_, id, _) in enumerate(known) if visible[k]}
+        # A row later, the robot is further.
+        later = line_time * corners[..., 1].mean(axis=1)
+        corners, depth = _seen_at(world + later[:, None, None] * np.array(velocities), intrinsics, world_from_camera)
+    focal = float(intrinsics.camera_matrix[0, 0])
+    return {
+        id: Prediction(corners[k], sigma * focal / z)
+        for k, ((id, sigma), z) in enumerate(zip(known, depth.tolist(), strict=True))
+        if z > 0.0
+    }
+
+
+def _seen_at(points_world: Array, intrinsics: Intrinsics, world_from_camera: Array) -> tuple[Array, Array]:
+    """(m, 4, 3) corners -> (m, 4, 2) px, and (m,) depth of the nearest, m: 0 for a marker behind the camera."""
+    in_camera = (points_world - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    depth = in_camera[..., 2].min(axis=1)
+    if not (depth > 1e-3).all():
+        depth = np.where(depth > 1e-3, depth, 0.0)
+        in_camera = np.where(depth[:, None, None] > 0.0, in_camera, [0.0, 0.0, 1.0])
+    return project(in_camera.reshape(-1, 3), intrinsics)[0].reshape(-1, 4, 2), depth
 
 
 def solve_six(view: View, seen: Sequence[Seen]) -> list[tuple[Array, Array, float]]:
@@ -324,59 +331,29 @@ def solve_six(view: View, seen: Sequence[Seen]) -> list[tuple[Array, Array, floa
     return sorted(found, key=lambda item: item[2])
 
 
-# A step that lessens the misfit by no more is the last. It is one of ten sigma of a corner's coordinate, or a pixel:
-# over such a distance the projection bends by a thousandth of one.
-_GAIN = 100.0
-
-
 def _planar(
     seen: Sequence[tuple[Body, Sequence[MarkerSighting]]],
     world_from_camera: Array,
     intrinsics: Intrinsics,
     placement: Array,
 ) -> dict[str, list[PoseHypothesis]]:
-    """x, y and yaw of level bodies, all in one go: Gauss and Newton, from where rays meet the plane of the corners."""
+    """Level bodies, by name, all in one go: what can be one call for all costs no more for many."""
     points = np.vstack([body.corners[sighting.id] for body, markers in seen for sighting in markers])
     corners = np.vstack([sighting.corners_px for _, markers in seen for sighting in markers])
-    sigma_px = np.repeat([sighting.sigma_px for _, markers in seen for sighting in markers], 4)
+    sigma_px = np.array([sighting.sigma_px for _, markers in seen for sighting in markers for _ in range(4)])
+    directions = rays(corners, intrinsics)
+    by_ray = np.ascontiguousarray(project(directions, intrinsics)[1][:, :, :2])
     count = np.array([4 * len(markers) for _, markers in seen])
-    # Corners lie body after body: `of` is whose each is, `first` where those of each body begin.
-    of, first = np.repeat(np.arange(len(seen)), count), np.cumsum(count) - count
-    state, possible = _on_floor(points, corners, world_from_camera, intrinsics, of, first)
-    camera, R = world_from_camera[:3, 3], world_from_camera[:3, :3]
-    for _ in range(20):
-        lever = _turned(points, state[of, 2])
-        in_camera = (lever - camera) @ R + state[of, :2] @ R[:2]
-        possible &= np.minimum.reduceat(in_camera[:, 2], first) > 1e-3
-        expected, by_point = project(np.where(possible[of, None], in_camera, [0.0, 0.0, 1.0]), intrinsics)
-        J = _by_pose(by_point @ R.T, lever) / sigma_px[:, None, None]
-        residual = (corners - expected) / sigma_px[:, None]
-        normal = np.add.reduceat(J.transpose(0, 2, 1) @ J, first)
-        gradient = np.add.reduceat((residual[:, None] @ J)[:, 0], first)[:, _PLANAR]
-        misfit = np.add.reduceat(np.square(residual).sum(axis=1), first)
-        noise = np.linalg.inv(normal[:, _PLANAR][:, :, _PLANAR])
-        step = (noise @ gradient[..., None])[..., 0]
-        gain = (step * gradient).sum(axis=1)
-        state, misfit = state + step, np.maximum(misfit - gain, 0.0)
-        if not ((gain > _GAIN) & possible).any():
-            break
-    # How the solved part answers to a motion of the body that it does not know of: dx = response @ motion. Height
-    # and tilt are errors of what was assumed ("consider" covariance), a misplaced camera is a motion of all six.
-    response = noise @ normal[:, _PLANAR]
-    assumed = np.zeros((len(seen), 6, 3))
-    assumed[:, _PLANAR] = response[:, :, _ASSUMED]
-    assumed[:, _ASSUMED] = -np.eye(3)
-    moved = response @ _body_by_placement(np.column_stack([state[:, :2], np.zeros(len(seen))]), camera)
-    inflation = [_inflation(m, 2 * n - 3) for m, n in zip(misfit.tolist(), count.tolist(), strict=True)]
-    covariance = assumed @ _ASSUMED_COVARIANCE @ assumed.transpose(0, 2, 1)
-    covariance[:, _PLANAR_ROWS, _PLANAR] += noise * np.array(inflation)[:, None, None]
-    covariance[:, _PLANAR_ROWS, _PLANAR] += moved @ placement @ moved.transpose(0, 2, 1)
+    states, covariances, misfits = solve_planar(
+        points, directions, by_ray, sigma_px, count, world_from_camera, placement
+    )
     hypotheses: dict[str, list[PoseHypothesis]] = {}
-    for k, (body, _) in enumerate(seen):
-        x, y, yaw = state[k].tolist()
-        if possible[k] and math.isfinite(x + y + yaw):
+    for (body, _), (x, y, yaw), covariance, misfit in zip(
+        seen, states.tolist(), covariances, misfits.tolist(), strict=True
+    ):
+        if math.isfinite(misfit):
             quaternion = np.array([math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
-            hypotheses[body.name] = [PoseHypothesis(np.array([x, y, 0.0]), quaternion, covariance[k], float(misfit[k]))]
+            hypotheses[body.name] = [PoseHypothesis(np.array([x, y, 0.0]), quaternion, covariance, misfit)]
     return hypotheses
 
 
@@ -387,40 +364,6 @@ def _six(view: View, seen: Sequence[Seen], placement: Array) -> list[PoseHypothe
         covariance = noise * _inflation(misfit, 2 * len(view.points_body) - 6) + moved @ placement @ moved.T
         hypotheses.append(_hypothesis(world_from_body, covariance, misfit))
     return hypotheses
-
-
-def _on_floor(
-    points: Array,
-    corners_px: Array,
-    world_from_camera: Array,
-    intrinsics: Intrinsics,
-    of: NDArray[np.int_],
-    first: NDArray[np.int_],
-) -> tuple[Array, NDArray[np.bool_]]:
-    """(m, 3) x, y and yaw of level bodies at z = 0, and for which there is one: each corner's ray cut with the plane at
-    that corner's height, then the rotation and shift of the plane that fit best (Umeyama, 1991, without scale, in two
-    dimensions)."""
-    directions = rays(corners_px, intrinsics) @ world_from_camera[:3, :3].T
-    camera = world_from_camera[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (points[:, 2] - camera[2]) / directions[:, 2]
-    met = np.isfinite(distance) & (distance > 0.0)
-    floor = camera[:2] + np.where(met, distance, 0.0)[:, None] * directions[:, :2]
-    count = np.bincount(of)[:, None]
-    middle_floor, middle_body = (np.add.reduceat(p, first) / count for p in (floor, points[:, :2]))
-    a, b = points[:, :2] - middle_body[of], floor - middle_floor[of]
-    yaw = np.arctan2(
-        np.add.reduceat(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], first), np.add.reduceat((a * b).sum(axis=1), first)
-    )
-    middle = np.column_stack([middle_body, np.zeros(len(yaw))])
-    return np.column_stack([middle_floor - _turned(middle, yaw)[:, :2], yaw]), np.logical_and.reduceat(met, first)
-
-
-def _turned(points: Array, yaw: Array) -> Array:
-    """(n, 3) points, each turned about z by its own angle (n,)."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y, z = points.T
-    return np.column_stack([c * x - s * y, s * x + c * y, z])
 
 
 def _by_pose(by_position: Array, lever: Array) -> Array:
@@ -452,14 +395,10 @@ def _inflation(misfit: float, degrees_of_freedom: int) -> float:
 
 
 def _body_by_placement(body: Array, camera: Array) -> Array:
-    """(..., 6, 6): how the poses of bodies at places (..., 3) move with that of a camera at another, both as position
-    and rotation along world axes."""
-    x, y, z = np.moveaxis(body - camera, -1, 0)
-    moved = np.zeros((*body.shape[:-1], 6, 6))
-    moved[...] = np.eye(6)
-    # -[x]x
-    moved[..., 0, 4], moved[..., 0, 5], moved[..., 1, 5] = z, -y, x
-    moved[..., 1, 3], moved[..., 2, 3], moved[..., 2, 4] = -z, y, -x
+    """(6, 6): how the pose of a body at a place (3,) moves with that of a camera at another, both as position and
+    rotation along world axes."""
+    moved = np.eye(6)
+    moved[:3, 3:] = -skew(body - camera)
     return moved
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from camera import fix
+from camera import fix, planar
 from camera.fix import Body, MarkerMount, MarkerPose, View, marker_corners, marker_poses, project, rays, solve
 from camera.markers import MarkerSighting
 from fusion.geometry import exp_so3, rotation_about_z, transform, transform_points
@@ -20,10 +20,10 @@ LOWEST, HIGHEST = 6.0 - 3.29 * np.sqrt(12.0 / TRIALS), 6.0 + 3.29 * np.sqrt(12.0
 
 def on_the_floor(random):
     """A robot anywhere in view, on a floor that is as uneven as the planar solve supposes."""
-    tilt = random.normal(0.0, fix.FLOOR_TILT_SIGMA, 2)
+    tilt = random.normal(0.0, planar.FLOOR_TILT_SIGMA, 2)
     return transform(
         rotation_about_z(random.uniform(-np.pi, np.pi)) @ exp_so3([*tilt, 0.0]),
-        [random.uniform(-0.9, 0.9), random.uniform(-0.7, 0.7), random.normal(0.0, fix.FLOOR_HEIGHT_SIGMA)],
+        [random.uniform(-0.9, 0.9), random.uniform(-0.7, 0.7), random.normal(0.0, planar.FLOOR_HEIGHT_SIGMA)],
     )
 
 
