@@ -136,8 +136,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if worst > UNKNOWN_DEG:
         raise CalibrationError(
-            f"{raw.name}: the drive shows the rotation to {min(worst, 180.0):.0f} deg only; drive a minute of curves, with "
-            "changes of speed, where the camera sees"
+            f"{raw.name}: the drive shows the rotation to {min(worst, 180.0):.0f} deg only; drive a minute of curves, "
+            "with changes of speed, where the camera sees"
         )
     if worst > POOR_DEG:
         print(f"steadfix: known to {worst:.1f} deg only; a longer drive with more curves tells more", file=sys.stderr)
