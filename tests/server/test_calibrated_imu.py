@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -10,7 +13,7 @@ import pytest
 
 from fusion.localiser import Localiser
 from fusion.simulator import random_ground, simulate
-from imu.mounting import ImuCalibration, rotation_from_deg
+from imu.mounting import ImuCalibration, rotation_from_deg, toml_lines
 from server.config import ConfigError, ImuConfig, RobotConfig, parse
 from server.recording import Recorder, RecordingError, load, load_calibration
 from server.replay import replay
@@ -66,6 +69,19 @@ def test_live_is_as_replayed_and_the_recording_holds_what_the_imu_read(tmp_path:
     # and of a calibration that has been found since
     other, _, _ = replay(load(tmp_path / "rover", calibration=robot.config.imu), Localiser("rover"))
     assert np.nanmax(np.abs(other[:, 1:4] - track[:, 1:4])) > 1e-4
+
+
+def test_the_service_records_the_calibration(tmp_path: Path) -> None:
+    (tmp_path / "room.toml").write_text(CONFIG)
+    command = ["run", str(tmp_path / "room.toml"), "--port", "0", "--record", str(tmp_path / "kept")]
+    service = subprocess.Popen([sys.executable, "-m", "server.cli", *command], stdout=subprocess.PIPE, text=True)
+    assert service.stdout is not None
+    with service, service.stdout as told:
+        assert "http://" in told.readline()
+        service.send_signal(signal.SIGINT)
+        assert service.wait(60.0) == 0
+    calibration = load_calibration(tmp_path / "kept" / "rover")
+    assert toml_lines(calibration) == toml_lines(parse(CONFIG).robot[0].imu)
 
 
 def test_a_perfect_imu_leaves_no_file(tmp_path: Path) -> None:
