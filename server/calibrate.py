@@ -7,7 +7,7 @@ import asyncio
 import datetime
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from camera.boards import DEFAULT_BOARD, BoardDetector, BoardView, parse_board
+from camera.boards import DEFAULT_BOARD, Board, BoardDetector, BoardView, parse_board
 from camera.calibration import Calibration, CalibrationError, Criterion, calibrate, coverage, judge, save_intrinsics
 from camera.capture import IMAGE_SUFFIXES, FrameSource, open_source, read_image
 from camera.guide import Guide, Step
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.is_dir() or not args.out.absolute().parent.is_dir():
         return _fail(f"--out {args.out}: a file in a folder that is there is needed", 2)
     if args.source is not None:
-        guided = _Guided(args, Guide(board))
+        guided = Guided(args, board)
         try:
             return asyncio.run(guided.run())
         except KeyboardInterrupt:
@@ -122,13 +122,14 @@ def _views(files: Iterator[Path], detector: BoardDetector) -> tuple[list[BoardVi
     return views, failed
 
 
-class _Guided:
+class Guided:
     """The live camera with its guide, on the terminal and on the page."""
 
-    def __init__(self, args: argparse.Namespace, guide: Guide) -> None:
-        self.guide = guide
+    def __init__(self, args: argparse.Namespace, board: Board, open: Callable[..., FrameSource] = open_source) -> None:
+        self.guide = Guide(board)
         self._args = args
-        self._detector = BoardDetector(guide.board)
+        self._open_source = open
+        self._detector = BoardDetector(board)
         self._said = ""
         self._boardless = time.monotonic()
         self._puzzle = ""
@@ -155,7 +156,7 @@ class _Guided:
                             await asyncio.to_thread(source.close)
                             source = None
                         self._tell(f"{error}; trying again")
-                        await page.show(self._state(Step(f"The camera is gone: {error}"), "trouble"), b"")
+                        await page.show(self._state(Step(f"The camera is lost: {error}"), "trouble"), b"")
                         await asyncio.sleep(pause)
                         pause = min(2.0 * pause, LONGEST_PAUSE)
                         continue
@@ -176,7 +177,7 @@ class _Guided:
         return status
 
     def _open(self) -> FrameSource:
-        return open_source(self._args.source, width_px=self._args.width_px, height_px=self._args.height_px)
+        return self._open_source(self._args.source, width_px=self._args.width_px, height_px=self._args.height_px)
 
     def _see(self, image: Pixels) -> Step:
         """One picture, told on the terminal."""
@@ -243,7 +244,7 @@ def _finish(args: argparse.Namespace, views: Sequence[BoardView], calibration: C
         sys.stdout.write(_text(calibration, criteria))
     sys.stdout.flush()
     if accepted:
-        _say(f"{args.out} is written")
+        _say(f"{args.out} is written; now `steadfix floor` tells on the floor whether a tape measure agrees")
     elif written:
         _say(f"{args.out} is written because of --force, but positions from it may be wrong: see what is missing")
     else:

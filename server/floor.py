@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         for name, placement in found.placements.items():
             sys.stdout.write(_text(name, placement, floors[name]))
         if args.tape:
-            sys.stdout.write(_anchor_sections(found, config))
+            sys.stdout.write(_tapes(found, args.tape) + _anchor_sections(found, config))
     sys.stdout.flush()
     for doubt in found.doubts:
         _say(f"DOUBT: {doubt}")
@@ -256,6 +256,17 @@ def _text(name: str, placement: Placement, floor: Array) -> str:
             cells = [f"{1e3 * by_place[x, y]:6.1f}" if (x, y) in by_place else " " * 6 for x in columns]
             lines.append(f"  y {y:6.2f} {''.join(cells)}")
         lines.append(f"       x  {''.join(f'{x:6.2f}' for x in columns)}")
+    return "\n".join(lines) + "\n"
+
+
+def _tapes(found: Survey, tapes: Sequence[Tape]) -> str:
+    """What was measured, and what came of it."""
+    at = {anchor.id: anchor.world_from_marker[:3, 3] for anchor in found.anchors}
+    lines = [
+        f"tape {tape}: {1e3 * tape.length:.0f} mm measured, "
+        f"{1e3 * np.linalg.norm(at[tape.first] - at[tape.second]):.1f} mm found"
+        for tape in tapes
+    ]
     return "\n".join(lines) + "\n"
 
 

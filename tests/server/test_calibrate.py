@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import contextlib
 import json
@@ -22,7 +23,8 @@ from playwright.async_api import Page, async_playwright
 
 from camera.boards import parse_board
 from camera.calibration import load_intrinsics
-from server import cli
+from camera.capture import Frame
+from server import calibrate, cli
 from server.calibration_page import CalibrationPage
 from tests.camera.board_views import CAMERA, Studio, good_poses
 from tests.data import data
@@ -63,7 +65,7 @@ def test_pictures_that_are_enough(capfd: pytest.CaptureFixture[str], pictures: P
     assert status == 0
     assert err.splitlines() == [
         "steadfix calibrate: the board is in 28 of 28 pictures",
-        f"steadfix calibrate: {out} is written",
+        f"steadfix calibrate: {out} is written; now `steadfix floor` tells on the floor whether a tape measure agrees",
     ]
     assert "MISSING" not in text
     np.testing.assert_allclose(load_intrinsics(out).camera_matrix, CAMERA.camera_matrix, atol=1.5)
@@ -181,7 +183,8 @@ def test_a_guided_calibration_ends_when_it_is_good(
     assert re.match(r"http://127\.0\.0\.1:\d+/ shows the picture", lines[0])
     assert next(line for line in lines if line.startswith("view ")) == "view 1 is taken, 0 of 8 conditions are met"
     assert any(line.startswith("Tilt the board: its ") for line in lines)
-    assert lines[-2:] == ["Done", f"{out} is written"]
+    assert lines[-2] == "Done"
+    assert lines[-1].startswith(f"{out} is written")
     assert "MISSING" not in text
     np.testing.assert_allclose(load_intrinsics(out).camera_matrix, CAMERA.camera_matrix, atol=2.0)
 
@@ -194,6 +197,48 @@ def test_a_source_that_ends_too_early_is_judged(capfd: pytest.CaptureFixture[str
     assert "the source has ended" in err
     assert json.loads(text)["written"] is None
     assert not (tmp_path / "camera.toml").exists()
+
+
+class Wobbly:
+    """A camera that is unplugged after the fourth picture, and cannot be opened at the first try after that."""
+
+    def __init__(self, pictures: list[np.ndarray]) -> None:
+        self.opened = self.closed = 0
+        self._pictures = pictures
+        self._read = 0
+
+    def open(self, source: str, **wishes: int) -> Wobbly:
+        assert wishes == {"width_px": 640, "height_px": 0}
+        self.opened += 1
+        if self.opened == 2:
+            raise FileNotFoundError("camera 0: not there")
+        return self
+
+    def read(self, timeout: float) -> Frame | None:
+        self._read += 1
+        if self._read == 5:
+            raise OSError("camera 0: lost; it no longer delivers frames")
+        return Frame(0.0, self._pictures.pop(0)) if self._pictures else None
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_a_camera_that_is_unplugged_and_plugged_in_again_goes_on(
+    capfd: pytest.CaptureFixture[str], film: Path, tmp_path: Path
+) -> None:
+    wobbly = Wobbly([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(film.iterdir())[:10]])
+    parser = argparse.ArgumentParser()
+    calibrate.add_arguments(parser)
+    options = ["--source", "0", "--width-px", "640", "--port", "0", "--out", str(tmp_path / "camera.toml")]
+    guided = calibrate.Guided(parser.parse_args(options), parse_board(BOARD), wobbly.open)
+    assert asyncio.run(guided.run()) == 1
+    err = capfd.readouterr().err
+    assert "camera 0: lost; it no longer delivers frames; trying again" in err
+    assert "camera 0: not there; trying again" in err
+    assert (wobbly.opened, wobbly.closed) == (3, 2)
+    # Two of the five places before it was lost, three after.
+    assert len(guided.guide.views) == 5
 
 
 class Session:

@@ -127,6 +127,7 @@ def test_tapes_alone(capfd: pytest.CaptureFixture[str], folder: Path) -> None:
     status, text, err = steadfix(capfd, folder / "room.toml", *tapes)
     assert status == 0
     assert "put the [[anchor]] sections above into" in err
+    assert re.search(r"^tape 40-43: 1502 mm measured, 150[012]\.\d mm found$", text, re.MULTILINE)
     # What it says is a configuration: with it the camera is where it is with the tapes.
     sections = text[text.index("[[anchor]]") :]
     places = parse('[[camera]]\nname="c"\nsource="f"\ncalibration="c"\n' + sections).anchor
