@@ -147,12 +147,18 @@ class _Visitor:
         self.refused = 0
         self._credit = BYTES_PER_SECOND * SAVED_UP
         self._credited = time.monotonic()
+        self._told = False
 
     async def receive(self) -> str | bytes:
         """Its next message. One that sends too much is not read for a while. Raises ConnectionClosed."""
         if self._credit < 0.0:
-            log.warning("%s sends more than %.0f kB a second and is made to wait", self.name, BYTES_PER_SECOND / 1e3)
-            await asyncio.sleep(SAVED_UP - self._credit / BYTES_PER_SECOND)
+            if not self._told:
+                self._told = True
+                text = f"more than {BYTES_PER_SECOND / 1e3:.0f} kB a second come, each message counting as "
+                text += f"{MESSAGE_COST} bytes more: they have to wait"
+                log.warning("%s: %s", self.name, text)
+                self.tell_now(Notice(text))
+            await asyncio.sleep(-self._credit / BYTES_PER_SECOND)
         data = await self.connection.recv()
         now = time.monotonic()
         earned = (now - self._credited) * BYTES_PER_SECOND
@@ -745,7 +751,8 @@ class Service:
             async with asyncio.timeout(HELLO_TIMEOUT):
                 while True:
                     data = await visitor.receive()
-                    visitor.dialect = Dialect(binary=isinstance(data, bytes))
+                    # One who sends JSON as binary is to read the answer.
+                    visitor.dialect = Dialect(binary=isinstance(data, bytes) and data[:1] != b"{")
                     try:
                         return decode(data)
                     except MessageError as error:
