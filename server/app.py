@@ -10,7 +10,6 @@ import asyncio
 import concurrent.futures
 import contextlib
 import functools
-import itertools
 import logging
 import math
 import socket
@@ -35,19 +34,18 @@ from websockets.http11 import Request, Response
 from fusion.localiser import warm_up
 from fusion.measurements import Pose
 from fusion.params import Channel
-from imu.protocols import TIME_LIMIT
 from imu.protocols.detection import Detector, open_parser
 from imu.uart import SerialImu
 from server.access import bearer, is_local, is_loopback, origin_allowed, tls, token_matches
 from server.camera_messages import camera_hello
 from server.cameras import FIRST_PAUSE, LONGEST_PAUSE, Camera, Open, Seen, open_configured
+from server.clock_questions import ClockQuestions
 from server.config import CameraConfig, Config
 from server.hub import STALL_LIMIT, Hub, Subscription
 from server.listening import cannot_listen, response
 from server.messages import (
     FORMATS,
     ClockAnswer,
-    ClockQuestion,
     Dialect,
     Error,
     Hello,
@@ -81,8 +79,6 @@ TRACKER_ROOM = 64 * 1024
 SILENCE = 3.0
 # s until a robot must have said who it is.
 HELLO_TIMEOUT = 10.0
-# s between clock questions, for the first ones and then.
-CLOCK_FAST, CLOCK_FAST_COUNT, CLOCK_SLOW = 0.1, 10, 1.0
 # s between two diagnoses of each robot: one takes about 2 ms.
 DIAGNOSE_EVERY = 5.0
 # s that a camera waits for the filters' word; without it, it looks where the markers were last.
@@ -177,11 +173,11 @@ class _Visitor:
 
 @dataclass(eq=False)
 class _Link:
-    """A robot's connection. `questions`: clock questions on the way, id -> when they were sent."""
+    """A robot's connection."""
 
     visitor: _Visitor
     heard: float
-    questions: dict[int, float] = field(default_factory=dict)
+    questions: ClockQuestions = field(default_factory=ClockQuestions)
 
 
 class Service:
@@ -788,13 +784,7 @@ class Service:
                 if robot.clock.restarts > restarts:
                     self._note(robot.config.name, f"its clock has jumped or started anew; it reads {readings[-1][0]} s")
             case ClockAnswer(id, received, sent):
-                asked = link.questions.pop(id, None)
-                if asked is None:
-                    raise MessageError(f"a clock answer with id {id}, which was not asked")
-                received, sent = dialect.seconds(received), dialect.seconds(sent)
-                if not max(abs(received), abs(sent)) < TIME_LIMIT:
-                    raise MessageError(f"a clock that reads {max(received, sent)} s; that is none")
-                robot.clock.exchange(asked, received, sent, arrival)
+                link.questions.take(id, dialect.seconds(received), dialect.seconds(sent), arrival, robot.clock)
             case Hello():
                 raise MessageError("a second hello")
 
@@ -807,15 +797,12 @@ class Service:
                 self.hub.answer(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
 
     async def _ask_clock(self, link: _Link) -> None:
-        visitor = link.visitor
-        for id in itertools.count():
+        visitor, questions = link.visitor, link.questions
+        while True:
             # A question that waits behind unsent poses would measure those.
             if visitor.connection.transport.get_write_buffer_size() == 0:
-                while len(link.questions) >= CLOCK_FAST_COUNT:
-                    del link.questions[next(iter(link.questions))]
-                now = link.questions[id] = time.monotonic()
-                visitor.tell_now(ClockQuestion(id, now))
-            await asyncio.sleep(CLOCK_FAST if id < CLOCK_FAST_COUNT else CLOCK_SLOW)
+                visitor.tell_now(questions.ask(time.monotonic()))
+            await asyncio.sleep(questions.pause)
 
 
 def _for_log(text: str) -> str:
