@@ -54,6 +54,9 @@ CLOCKS_LEAST = 60.0  # s between the stamps of the IMU and of fixes
 # An offset of a marker or of the IMU on the robot: m; sigmas; its share of the innovations; fixes in all, of a marker.
 PLACE_LEAST, PLACE_SIGMAS, PLACE_SHARE, PLACE_FIXES, PLACE_GROUP = 0.015, 10.0, 0.2, 30, 10
 PLACE_TURN, PLACE_LIKELY = math.radians(2.0), 0.05  # and the share from which the filter's states are not told
+RISE_LEAST = 0.15  # m between the 5th and the 95th percentile of the height
+WAY_PAIRS, WAY_STEP, WAY_SIGMAS = 20, 1.5, 8.0  # pairs of fixes, at most s apart
+HEADING_LEAST, ASIDE_LEAST = 2.0, 0.15  # deg; share of the way
 LATE_SHARE, LATE_FIXES, LATE_OF_BUFFER = 0.01, 3, 0.8
 NO_FIX = 5.0  # s
 RESETS = 2
@@ -160,7 +163,9 @@ def diagnose(seen: Seen) -> list[Diagnosis]:
         if codes & causes:
             # Much else is wrong then, but nothing of it is the cause.
             return [diagnosis for diagnosis in found if diagnosis.code in causes | besides]
-    odd, (places, likely) = list(_of_turns(fixes)), _of_places(seen, 2 if planar else 3)
+    odd = [*_of_turns(fixes), *_of_motion(seen)]
+    # Where the robot does not move as is assumed, innovations tell nothing else.
+    places, likely = ([], False) if odd else _of_places(seen, 2 if planar else 3)
     if not odd and not places:
         found += _of_learned(seen, codes)
     if not likely:
@@ -327,6 +332,78 @@ def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
                 text = f"fixes{name} are about {times:.1f} x less accurate in {block} than they say"
                 evidence = {"times": times, "components": e.size, "sigmas": sigmas}
                 yield Diagnosis(f"fix_{block}_noise", "warning", text, _origin(source, markers) | evidence)
+
+
+def _of_motion(seen: Seen) -> Iterator[Diagnosis]:
+    """Does the robot move as its motion model says? By the fixes alone."""
+    motion = seen.localiser.motion
+    fixes = [fix for fix in seen.fixes if fix.outcome.outcome in BELIEVED]
+    if motion == "free" or len(fixes) < WAY_PAIRS:
+        return
+    height = np.array([fix.pose.position[2] for fix in fixes])
+    low, high = np.percentile(height, (5.0, 95.0)).tolist()
+    sigmas = (high - low) / math.sqrt(float(np.median([fix.pose.covariance[2, 2] for fix in fixes])))
+    if high - low >= RISE_LEAST and sigmas >= WAY_SIGMAS:
+        text = (
+            f'it rises and falls by {high - low:.2f} m in its fixes, with motion = "{motion}": is it carried, or are '
+        )
+        text += 'there ramps? motion = "free" is for that'
+        yield Diagnosis("motion", "warning", text, {"rise_m": high - low, "sigmas": sigmas})
+    if motion == "differential":
+        groups: dict[tuple[int, ...], list[JudgedFix]] = {}
+        for fix in fixes:
+            groups.setdefault(fix.markers, []).append(fix)
+        for markers, own in groups.items():
+            yield from _of_way(markers, own)
+
+
+def _of_way(markers: tuple[int, ...], fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
+    """Does a robot on two wheels go where its fixes head?
+
+    On an arc the chord has the heading of its middle. A marker that is turned on the robot turns the way by as much,
+    and one that sits in front of the axle goes aside as the robot turns.
+    """
+    t = np.array([fix.outcome.t for fix in fixes])
+    close = np.diff(t) <= WAY_STEP
+    if np.sum(close) < WAY_PAIRS:
+        return
+    position = np.array([fix.pose.position for fix in fixes])
+    variance = np.array([fix.pose.covariance for fix in fixes]).diagonal(axis1=1, axis2=2)
+    heading = np.unwrap([2.0 * math.atan2(z, w) for w, _, _, z in (fix.pose.quaternion_wxyz for fix in fixes)])
+    middle, turned = 0.5 * (heading[1:] + heading[:-1])[close], np.diff(heading)[close]
+    x, y = np.diff(position[:, :2], axis=0)[close].T
+    ahead, aside = np.cos(middle) * x + np.sin(middle) * y, np.cos(middle) * y - np.sin(middle) * x
+    both = (variance[1:] + variance[:-1])[close]
+    noise = both[:, :2].mean(axis=1) + 0.25 * (x**2 + y**2) * both[:, 5]
+    ways = np.column_stack([ahead, turned])
+    normal = (ways / noise[:, np.newaxis]).T @ ways + 1e-6 * np.eye(2)
+    slope, lever = np.linalg.solve(normal, (ways / noise[:, np.newaxis]).T @ aside).tolist()
+    left = aside - slope * ahead - lever * turned
+    scatter = max(1.0, float(np.mean(left**2 / noise)))
+    of_slope, of_lever = np.sqrt(scatter * np.linalg.inv(normal).diagonal()).tolist()
+
+    evidence: dict[str, Any] = {"markers": list(markers)} if markers else {}
+    name, pairs = _named(markers) or "its marker", len(left)
+    degrees, mm = math.degrees(math.atan(slope)), 1e3 * lever
+    if abs(degrees) >= HEADING_LEAST and abs(slope) >= WAY_SIGMAS * of_slope:
+        text = (
+            f"it drives {abs(degrees):.1f} deg to the {'left' if degrees > 0.0 else 'right'} of where its fixes head: "
+        )
+        text += f"{name} is turned on the robot otherwise than is entered"
+        figures = {"off_deg": degrees, "sigmas": abs(slope) / of_slope, "pairs": pairs}
+        yield Diagnosis("marker_heading", "warning", text, evidence | figures)
+    if abs(lever) >= PLACE_LEAST and abs(lever) >= WAY_SIGMAS * of_lever:
+        text = f"{name} sits {abs(mm):.0f} mm farther to the {'front' if mm > 0.0 else 'back'} than is entered: "
+        text += "so far from the axle it goes aside in turns, and the body's origin is on the axle"
+        figures = {"mm": [mm], "sigmas": abs(lever) / of_lever, "pairs": pairs}
+        yield Diagnosis("marker_place", "warning", text, evidence | figures)
+    share = math.sqrt(max(0.0, float(np.sum(left**2 - noise))) / max(float(np.sum(ahead**2 + aside**2)), 1e-9))
+    sigmas = float(np.sum(np.minimum(left**2 / noise - 1.0, 9.0))) / math.sqrt(2.0 * pairs)
+    if share >= ASIDE_LEAST and sigmas >= WAY_SIGMAS:
+        text = (
+            f"{share:.0%} of its way is sideways in its fixes: its wheels slip or slide, or it is no differential drive"
+        )
+        yield Diagnosis("wheels_slide", "warning", text, evidence | {"share": share, "sigmas": sigmas, "pairs": pairs})
 
 
 def _of_learned(seen: Seen, known: set[str]) -> Iterator[Diagnosis]:

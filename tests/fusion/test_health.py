@@ -131,6 +131,7 @@ NOISY_ACCEL = ImuParams(accel=TriadParams(noise=6e-2, bias_sigma=0.2, bias_walk=
 WEAK_GYRO = ImuParams(gyro=TriadParams(noise=1e-3, bias_sigma=0.02, limit=2.18))
 WRONG_ACCEL = ImuParams(accel=TriadParams(noise=2e-2, bias_sigma=0.2, bias_walk=1e-3, scale_sigma=0.3))
 NO_FIX = frozenset({"no_fix"})
+SWAYING = np.array([[[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]], [[1.0, 0.4, 0.0]]])  # it looks now to the left, now right
 FAULTS = {
     "stamps late": Fault("stamps", lambda s: drive(s, camera=CameraParams(stamp_error=0.032)), "late_ms", 25, 39),
     "stamps early": Fault("stamps", lambda s: drive(s, camera=CameraParams(stamp_error=-0.05)), "late_ms", -57, -43),
@@ -231,6 +232,29 @@ FAULTS = {
         15,
         110,
         "free",
+    ),
+    "heading of the only marker": Fault(
+        "marker_heading", lambda s: marked(s, -5.0, share=1.0), "off_deg", 4.5, 5.5, "differential"
+    ),
+    "the only marker before the axle": Fault(
+        "marker_place", lambda s: marked(s, shift=(0.1, 0.0, 0.0), share=1.0), "mm", 90, 110, "differential"
+    ),
+    "drives sideways": Fault(
+        "wheels_slide",
+        lambda s: simulate(replace(random_ground(s), angles=SWAYING), s, 90.0),
+        "share",
+        0.3,
+        1.0,
+        "differential",
+        frozenset({"marker_heading", "resets", "no_fix"}),
+    ),
+    "carried about": Fault(
+        "motion",
+        lambda s: simulate(aggressive(s), s, 90.0),
+        "rise_m",
+        0.5,
+        1.6,
+        besides=frozenset({"resets", "no_fix", "fix_attitude_noise", "fix_position_noise"}),
     ),
     "wrong scale": Fault(
         "accel_motion",
