@@ -168,6 +168,16 @@ def test_what_of_a_token_is_no_hash() -> None:
         parse(TOKENS.replace(hashlib.sha256(b"drive").hexdigest(), "12"))
 
 
+def test_json_in_a_binary_message_is_answered_in_json() -> None:
+    async def main() -> None:
+        async with serving() as service, client(service, "/v1/robot") as connection:
+            await connection.send(b'{"type":"hello","robot":"rover"}')
+            assert "JSON goes into text messages" in (await heard(connection, "error"))["reason"]
+            assert (await hello(connection))["type"] == "welcome"
+
+    run(main)
+
+
 def test_many_tokens_are_not_tried_in_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("server.app.WRONG_TOKEN_PAUSE", 0.3)
 
@@ -291,7 +301,8 @@ def test_a_flood_is_made_to_wait_and_the_others_are_not(
             await until(lambda: counts["rover"].counts["imu_samples"] == 100)
             # 100 messages of 500 bytes and what is in them, less what was saved up.
             assert time.monotonic() - began > 0.5
-            assert "sends more than 50 kB a second and is made to wait" in caplog.text
+            assert "more than 50 kB a second come" in caplog.text
+            assert "more than 50 kB a second come" in (await heard(flooding, "notice"))["text"]
 
     run(main)
 
