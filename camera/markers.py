@@ -324,20 +324,26 @@ class _Decoder:
         """The markers among quadrilaterals (n, 4, 2) px, each place at most once. `decoded` (n,): those that OpenCV
         could read, of which less is demanded."""
         # A rough look first: measuring corners costs more, and most of what a textured floor yields is no marker.
-        rough = self._samples(image, quads)
-        _, _, ahead, likeness = self._best(rough)
-        worth = (likeness >= _FIRST_LOOK[0]) & (ahead <= _FIRST_LOOK[1])
-        worth &= decoded | (_shortest_sides(quads) >= _CELL_PX * self.cells)
+        unread = np.flatnonzero(~decoded & (_shortest_sides(quads) >= _CELL_PX * self.cells))
+        worth = decoded.copy()
+        if unread.size:
+            _, _, ahead, likeness = self._best(self._samples(image, quads[unread]))
+            worth[unread] = (likeness >= _FIRST_LOOK[0]) & (ahead <= _FIRST_LOOK[1])
         if not worth.any():
             return []
-        quads, decoded, rough = quads[worth], decoded[worth], rough[worth]
+        quads, decoded = quads[worth], decoded[worth]
         corners, sigma, blur = refine_corners(image, quads, self.cells)
         samples = self._samples(image, corners)
         marker, turn, ahead, likeness = self._best(samples)
         like = np.flatnonzero((likeness >= _CELLS) & (ahead <= _AHEAD) & (samples.std(axis=(1, 2)) >= _CONTRAST))
         if not like.size:
             return []
-        upright = [np.rot90(picture[k], -turn[k]) for picture in (samples, rough) for k in like]
+        rough = self._samples(image, quads[like])
+        upright = [
+            np.rot90(picture, -turn[k])
+            for pictures in (samples[like], rough)
+            for picture, k in zip(pictures, like, strict=True)
+        ]
         scores = self._likeness(np.array(upright), marker[like].tolist() * 2).reshape(2, -1)
         found = []
         for k, score, before in zip(like.tolist(), *scores.tolist(), strict=True):

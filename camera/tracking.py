@@ -44,6 +44,9 @@ SEARCH_EVERY, SEARCH_INTERVAL = 10, 0.5
 # s between two while none is missing, lest one is there twice.
 SWEEP_INTERVAL = 5.0
 
+# Of markers that are still, so many are looked at in a frame: enough to tell a shaken camera from a marker that moved.
+STILL_AT_ONCE = 4
+
 # Around a marker's place: one window is enough for one that is sharp and well lit, three find most others.
 _NEARBY = (Pass(windows=(13, 13, 10), darker=10.0), Pass())
 # The whole picture: the cheap ways, which find nearly all sharp markers whose sides are long, short and tiny, px, ...
@@ -121,21 +124,24 @@ class MarkerTracker:
         to the next one's; each sighting is stamped by the row of its middle.
         """
         picture = grey(image)
-        expected = self._expected(t, predictions or {})
+        # Those that were looked at longest ago have their turn.
+        in_view = [id for id in self._still & self._tracks.keys() if self._missed[id] <= _GIVEN_UP]
+        resting = frozenset(sorted(in_view, key=lambda id: self._tracks[id].t)[STILL_AT_ONCE:])
+        expected = self._expected(t, predictions or {}, resting)
         found = self._follow(picture, t, expected)
         missed = {id: where for id, where in expected.items() if id not in found}
         if missed:
             found |= self._look_nearby(picture, missed)
         self._since_search += 1
-        if missing := self.ids - found.keys():
+        if missing := self.ids - found.keys() - resting:
             due = self._since_search >= SEARCH_EVERY or not 0.0 <= t - self._searched < SEARCH_INTERVAL
             if due or any(self._missed.get(id) == 0 for id in missing):
-                found = self._search(picture, found, missing=True)
+                found = self._search(picture, found, missing)
                 self._since_search, self._searched = 0, t
         elif not 0.0 <= t - self._swept < SWEEP_INTERVAL:
-            found = self._search(picture, found, missing=False)
+            found = self._search(picture, found, missing)
             self._swept = t
-        self._remember(found, t)
+        self._remember(found, t, resting)
         return [
             MarkerSighting(
                 t + line_time * float(marker.corners_px[:, 1].mean()),
@@ -148,12 +154,14 @@ class MarkerTracker:
             for id, marker in sorted(found.items())
         ]
 
-    def _expected(self, t: float, predictions: Mapping[int, Prediction]) -> dict[int, Prediction]:
+    def _expected(
+        self, t: float, predictions: Mapping[int, Prediction], resting: Collection[int]
+    ) -> dict[int, Prediction]:
         """Where to look: as predicted, unless what the last frames tell is better."""
         expected = {id: where for id, where in predictions.items() if id in self.ids}
         for id, track in self._tracks.items():
             dt = t - track.t
-            if id in expected and expected[id].sigma_px <= _SIGMA_PX:
+            if id in expected and expected[id].sigma_px <= NEAR_PX:
                 continue
             if id in self._still:
                 own = Prediction(track.corners_px, _SIGMA_PX, track.sigma_px)
@@ -168,7 +176,7 @@ class MarkerTracker:
         return {
             id: where
             for id, where in expected.items()
-            if id not in self.repeated and self._missed.get(id, 0) <= _GIVEN_UP
+            if id not in self.repeated and id not in resting and self._missed.get(id, 0) <= _GIVEN_UP
         }
 
     def _follow(self, picture: Image, t: float, expected: Mapping[int, Prediction]) -> dict[int, Found]:
@@ -211,8 +219,8 @@ class MarkerTracker:
             found |= _nearest([marker for marker in looked if marker.id in left], left)
         return found
 
-    def _search(self, picture: Image, found: dict[int, Found], missing: bool) -> dict[int, Found]:
-        """The whole picture: cheaply; while one is missing with everything that the default detector does, too, and in
+    def _search(self, picture: Image, found: dict[int, Found], missing: Collection[int]) -> dict[int, Found]:
+        """The whole picture: cheaply; while one is missing, with everything that the default detector does, too, and in
         one way more."""
         shortest, longest = self.sides_px or (math.inf, math.inf)
         cheap = (_LONG, _SHORT) if shortest >= _LONG_PX else (_SHORT,) if shortest >= _SHORT_PX else (_TINY,)
@@ -228,7 +236,7 @@ class MarkerTracker:
                 continue
             before = len(seen)
             seen = distinct(seen + self._detector.look(picture, way, bounds))
-            if self.ids <= {marker.id for marker in seen}:
+            if set(missing) <= {marker.id for marker in seen}:
                 break
         else:
             self._hard += len(seen) == before
@@ -238,9 +246,9 @@ class MarkerTracker:
         self.repeated = frozenset(id for id, markers in by_id.items() if len(markers) > 1)
         return {id: markers[0] for id, markers in by_id.items() if id not in self.repeated}
 
-    def _remember(self, found: Mapping[int, Found], t: float) -> None:
+    def _remember(self, found: Mapping[int, Found], t: float, resting: Collection[int]) -> None:
         for id in self._missed:
-            self._missed[id] += 1
+            self._missed[id] += id not in resting
         for id, marker in found.items():
             before = self._tracks.get(id)
             velocity = np.zeros((4, 2))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from camera.synthetic import Room
-from camera.tracking import SEARCH_EVERY, MarkerTracker, Prediction
+from camera.tracking import SEARCH_EVERY, STILL_AT_ONCE, MarkerTracker, Prediction
 from fusion.geometry import rotation_about_z, transform
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA
 from tests.camera.test_markers import HARD, errors, frame
@@ -78,6 +78,15 @@ def test_a_slow_camera_searches_every_frame():
     for k in range(3):
         assert tracker.track(EMPTY, 0.5 * k) == []
     assert len(tracker.track(image, 2.0)) == 1
+
+
+def test_of_many_markers_at_rest_each_has_its_turn():
+    image, _ = frame(45)
+    tracker = MarkerTracker("4X4_50", ids=range(6), still=range(6))
+    assert [len(tracker.track(image, k / RATE_HZ)) for k in range(2)] == [6, 6]  # search, and sweep for repeated ones
+    seen = [{s.id for s in tracker.track(image, k / RATE_HZ)} for k in range(2, 8)]
+    assert [len(ids) for ids in seen] == [STILL_AT_ONCE] * 6
+    assert all(sum(id in ids for ids in seen) == STILL_AT_ONCE for id in range(6))
 
 
 @pytest.mark.parametrize("case", ["dark", "small", "blurred"])
