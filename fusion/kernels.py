@@ -5,8 +5,8 @@ It is one file because numba's cache does not notice an edited callee in another
 The model
 ---------
 Nominal state x: attitude q (world_from_body), velocity v and position p (world), gyroscope and accelerometer bias
-(body), camera time offset t_d, tilt c of the vertical in the world frame. The IMU is an input. The error is
-left-invariant, in body axes, 18 numbers:
+(body), camera time offset t_d, tilt c of the vertical in the world frame, errors of scale s of wheel odometry. The IMU
+is an input. The error is left-invariant, in body axes, 20 numbers:
 
     R = R̂ Exp(δθ)   v = v̂ + R̂ δv   p = p̂ + R̂ δp   and plain differences for the rest,
 
@@ -37,10 +37,10 @@ from fusion.measurements import Array
 from fusion.params import GRAVITY
 
 # --- One filter: nominal state, then the covariance of its error, row by row -------------------------------------
-Q, V, POS, BG, BA, TD, TILT = 0, 4, 7, 10, 13, 16, 17
-COV = 20
-N = 18
-TH, DV, DP, DBG, DBA, DTD, DTILT = 0, 3, 6, 9, 12, 15, 16
+Q, V, POS, BG, BA, TD, TILT, WHEEL = 0, 4, 7, 10, 13, 16, 17, 19
+COV = 21
+N = 20
+TH, DV, DP, DBG, DBA, DTD, DTILT, DWHEEL = 0, 3, 6, 9, 12, 15, 16, 18
 CORRECTED = COV + N * N  # sum of all moves by updates, world axes: position (3), rotation vector (3)
 BLOCK = CORRECTED + 6
 
@@ -77,9 +77,23 @@ MOVING_GYRO, MOVING_ACCEL = AUX + 56, AUX + 57  # mean variance of a window in m
 STILL_SURE = AUX + 58  # 1 where rest and motion differ in that
 USUAL_SPEED2 = AUX + 59  # (m/s)^2: mean squared speed along an axis while the robot moves
 REJECTED_RUN = AUX + 60  # rejects since the last accepted fix
+WHEEL_CURSOR = AUX + 63  # number of the next wheel reading to come
+T_WHEEL = AUX + 64  # s: stamp of the last one
+WHEEL_RATE = AUX + 65  # rad/s: its yaw rate, by its scale
+WHEEL_NIS = AUX + 66  # running mean of the squared innovation of speed and of yaw rate over the expected one (2)
+SAME_RUN = AUX + 68  # so many IMU samples in a row repeat the one before to the last digit
+CHANGE_GYRO, CHANGE_ACCEL = AUX + 69, AUX + 70  # mean squared change from sample to sample
+LARGEST_GYRO, LARGEST_ACCEL = AUX + 71, AUX + 72  # magnitude along an axis
+SUSPECT = AUX + 73  # 1 where the last sample was held to be lost
+BLIND = AUX + 74  # 1 while what the IMU says is not what the robot does
+GRID_AT = AUX + 75  # number of the last step of the grid
+CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
+PLACE = AUX + 76  # m: mean of where fixes have found it (3)
+PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (3)
+PLACE_COUNT = AUX + 82
 ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
 T_ADAPTED = AUX + 62  # s: the last of them
-STATE = AUX + 63
+STATE = AUX + 85
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -123,9 +137,12 @@ CHANNEL = BEFORE_CORRECTED + 6
     STILL_RATE,
     FIX_CORRELATION,
     ADAPTATION,
+    WHEEL_SPEED_SIGMA,
+    WHEEL_RATE_SIGMA,
+    WHEEL_SCALE_SIGMA,
     MOTION,
-) = range(30)
-PARAMS = 30
+) = range(33)
+PARAMS = 33
 FREE, GROUND, DIFFERENTIAL = 0.0, 1.0, 2.0
 
 # --- A fix: stamp, arrival, number of hypotheses, then per hypothesis position, quaternion, covariance, misfit -----
@@ -144,12 +161,18 @@ PENDING, INIT, ACCEPTED, INFLATED, REJECTED, REINIT, TOO_LATE, DUPLICATE = range
 IMU_FIRST, IMU_END, FIX_FIRST, FIX_END, CP_FIRST, CP_END = range(6)
 HORIZON = 6  # s: newest stamp of any input
 IMU_DUPLICATES, IMU_LATE, REWINDS = 7, 8, 9
-META = 10
+WHEEL_FIRST, WHEEL_END, WHEEL_DUPLICATES, WHEEL_LATE = 10, 11, 12, 13
+AHEAD = 14  # s: the last stamp that was too far ahead to be believed
+META = 15
 
 IMU_CAPACITY = 2048  # two seconds at 1 kHz
 FIX_CAPACITY = 256  # two seconds of four cameras at 30 Hz
+WHEEL_CAPACITY = 256  # two seconds at 100 Hz
 CP_CAPACITY = 32
 IMU_MASK, FIX_MASK, CP_MASK = IMU_CAPACITY - 1, FIX_CAPACITY - 1, CP_CAPACITY - 1  # all are powers of two
+WHEEL_MASK = WHEEL_CAPACITY - 1
+IMU_ROW, WHEEL_ROW = 7, 3  # t, gyro, accel; t, forward speed, yaw rate
+FAR_AHEAD = 60.0  # s
 CP_PER_BUFFER = 20  # a checkpoint each twentieth of the buffer, 100 ms by default: what is written stays in the cache
 
 # --- A pose as it leaves: t, position, quaternion, velocity, rate, covariance, velocity covariance, bookkeeping ----
@@ -170,11 +193,30 @@ MOST_TAUGHT = 6.0  # d2 / dof - 1 of one fix, at most, that the noise learns fro
 LEAST_EXCESS, MOST_EXCESS = -1.0, 8.0  # bounds of EXCESS: e^8 is 55 times the sigma
 IGNORED_EXCESS = 0.7  # less is chance: matched noise wanders about so far
 ADAPTATION_HZ = 2.0  # fixes more often than this share their say in the noise
+NOTHING, A_FIX, A_READING = range(3)
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
-STILL_SPEED_SIGMA = 0.01  # m/s
+STILL_SPEED_SIGMA = 0.003  # m/s
 LEAVE_STILL = 9.35  # chi-square .975 at 3 degrees of freedom: a fix that is further off says that the robot moves
 STILL_PAUSE = 2.0  # s: and for so long it is believed
+LEAST_CONSTRAINT = 0.02  # of a constraint's variance is believed where it is kept ever so well
+STUCK_AFTER = 8  # samples that repeat each other to the last digit: nobody measures
+SPIKE = 20.0  # times the usual change, and more than these: one sample alone is held to be lost
+SPIKE_GYRO, SPIKE_ACCEL = 3.0, 30.0  # rad/s, m/s2
+IMPOSSIBLE_GYRO, IMPOSSIBLE_ACCEL = (
+    140.0,
+    1000.0,
+)  # rad/s, m/s2: more than a sensor of 4000 deg/s and 50 g can change by
+SATURATED_GYRO, SATURATED_ACCEL = 2.0, 15.0  # rad/s, m/s2: no sensor's range is smaller
+CLIPPED_OFTEN = 3  # times the very largest reading twice in a row: that is where it saturates
+TIME_OFFSET_WALK = 1e-3  # s/√s: a camera that has connected anew has another
+PLACE_TIME = 5.0  # s: for so long a robot keeps to a part of its usual place
+PLACE_FIXES = 120  # so many fixes say what that is
+LEAST_PLACE = 0.3  # m: and it is no smaller than this
+BLIND_TIME = 0.3  # s^0.5: noise of a sensor that is no witness, in its largest reading
+MOST_BRIDGED = 60.0  # s
+COAST_TIME = 1.0  # s: nothing is known any more, and the speed decays with this time constant
+UNKNOWN_HEADING = 1.8  # rad: as uncertain as a heading can be, pi/√3
 GRAVITY_SIGMA = 0.5  # m/s2: how far the mean specific force before the start may be from gravity, by motion
 UNKNOWN_TILT_SIGMA = math.radians(30.0)  # of a flat marker whose two poses are too close to call
 
@@ -310,56 +352,91 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_wa
     # F P Fᵀ as F (F P)ᵀ: the same loop twice, over columns that lie side by side in memory. The second round is needed
     # for the first nine columns only, since F leaves the rest alone.
     for second in range(2):
-        for j in range(N - 9 * second):
-            t0, t1, t2 = f[c + j], f[c + 18 + j], f[c + 36 + j]
-            v0, v1, v2 = f[c + 54 + j], f[c + 72 + j], f[c + 90 + j]
-            p0, p1, p2 = f[c + 108 + j], f[c + 126 + j], f[c + 144 + j]
-            e0, e1 = f[c + 288 + j], f[c + 306 + j]
-            u0 = d2 * t1 - d1 * t2 - dt * f[c + 216 + j] + c00 * e0 + c01 * e1
-            u1 = d0 * t2 - d2 * t0 - dt * f[c + 234 + j] + c10 * e0 + c11 * e1
-            u2 = d1 * t0 - d0 * t1 - dt * f[c + 252 + j] + c20 * e0 + c21 * e1
+        for j in range(9 if second else N):
+            t0, t1, t2 = f[c + j], f[c + 20 + j], f[c + 40 + j]
+            v0, v1, v2 = f[c + 60 + j], f[c + 80 + j], f[c + 100 + j]
+            p0, p1, p2 = f[c + 120 + j], f[c + 140 + j], f[c + 160 + j]
+            e0, e1 = f[c + 320 + j], f[c + 340 + j]
+            u0 = d2 * t1 - d1 * t2 - dt * f[c + 240 + j] + c00 * e0 + c01 * e1
+            u1 = d0 * t2 - d2 * t0 - dt * f[c + 260 + j] + c10 * e0 + c11 * e1
+            u2 = d1 * t0 - d0 * t1 - dt * f[c + 280 + j] + c20 * e0 + c21 * e1
             p0 += dt * v0 + h * u0
             p1 += dt * v1 + h * u1
             p2 += dt * v2 + h * u2
             v0 += u0
             v1 += u1
             v2 += u2
-            t0 -= dt * f[c + 162 + j]
-            t1 -= dt * f[c + 180 + j]
-            t2 -= dt * f[c + 198 + j]
+            t0 -= dt * f[c + 180 + j]
+            t1 -= dt * f[c + 200 + j]
+            t2 -= dt * f[c + 220 + j]
             f[c + j] = a00 * t0 + a01 * t1 + a02 * t2
-            f[c + 18 + j] = a10 * t0 + a11 * t1 + a12 * t2
-            f[c + 36 + j] = a20 * t0 + a21 * t1 + a22 * t2
-            f[c + 54 + j] = a00 * v0 + a01 * v1 + a02 * v2
-            f[c + 72 + j] = a10 * v0 + a11 * v1 + a12 * v2
-            f[c + 90 + j] = a20 * v0 + a21 * v1 + a22 * v2
-            f[c + 108 + j] = a00 * p0 + a01 * p1 + a02 * p2
-            f[c + 126 + j] = a10 * p0 + a11 * p1 + a12 * p2
-            f[c + 144 + j] = a20 * p0 + a21 * p1 + a22 * p2
+            f[c + 20 + j] = a10 * t0 + a11 * t1 + a12 * t2
+            f[c + 40 + j] = a20 * t0 + a21 * t1 + a22 * t2
+            f[c + 60 + j] = a00 * v0 + a01 * v1 + a02 * v2
+            f[c + 80 + j] = a10 * v0 + a11 * v1 + a12 * v2
+            f[c + 100 + j] = a20 * v0 + a21 * v1 + a22 * v2
+            f[c + 120 + j] = a00 * p0 + a01 * p1 + a02 * p2
+            f[c + 140 + j] = a10 * p0 + a11 * p1 + a12 * p2
+            f[c + 160 + j] = a20 * p0 + a21 * p1 + a22 * p2
         if second == 0:
             for i in range(9):
                 for j in range(i):
-                    swap = f[c + 18 * i + j]
-                    f[c + 18 * i + j] = f[c + 18 * j + i]
-                    f[c + 18 * j + i] = swap
+                    swap = f[c + N * i + j]
+                    f[c + N * i + j] = f[c + N * j + i]
+                    f[c + N * j + i] = swap
                 for j in range(9, N):
-                    f[c + 18 * j + i] = f[c + 18 * i + j]
+                    f[c + N * j + i] = f[c + N * i + j]
 
     angle_noise = gyro_noise * gyro_noise * dt
     velocity_noise = accel_noise * accel_noise * dt
     for i in range(3):
-        f[c + 19 * (TH + i)] += angle_noise
-        f[c + 19 * (DV + i)] += velocity_noise
-        f[c + 19 * (DP + i)] += velocity_noise * dt * dt / 3.0
-        f[c + 18 * (DV + i) + DP + i] += velocity_noise * h
-        f[c + 18 * (DP + i) + DV + i] += velocity_noise * h
-        f[c + 19 * (DBG + i)] += gyro_bias_walk * gyro_bias_walk * dt
-        f[c + 19 * (DBA + i)] += accel_bias_walk * accel_bias_walk * dt
+        f[c + (N + 1) * (TH + i)] += angle_noise
+        f[c + (N + 1) * (DV + i)] += velocity_noise
+        f[c + (N + 1) * (DP + i)] += velocity_noise * dt * dt / 3.0
+        f[c + N * (DV + i) + DP + i] += velocity_noise * h
+        f[c + N * (DP + i) + DV + i] += velocity_noise * h
+        f[c + (N + 1) * (DBG + i)] += gyro_bias_walk * gyro_bias_walk * dt
+        f[c + (N + 1) * (DBA + i)] += accel_bias_walk * accel_bias_walk * dt
+
+
+@_jit
+def _slow(f, dt, noise):
+    """What `predict` leaves out where nothing is measured: the speed decays, and what pushes the robot is white.
+
+    The Ornstein-Uhlenbeck process v' = -v/τ + w, w of density `noise`, over dt s, which `predict` has carried at
+    constant speed: with e = exp(-dt/τ) speed is left with e v, and position moved by τ(1 - e) v. In one step or many
+    it is the same. (D. Gillespie, "Exact numerical simulation of the Ornstein-Uhlenbeck process and its integral",
+    Phys. Rev. E 54(2), 1996.)
+    """
+    e = math.exp(-dt / COAST_TIME)
+    gone = COAST_TIME * (1.0 - e)
+    for i in range(3):
+        f[POS + i] += (gone - dt) * f[V + i]
+        f[V + i] *= e
+    c = COV
+    for _ in range(2):
+        # rows, then columns as rows of the transpose
+        for i in range(3):
+            for j in range(N):
+                f[c + N * (DP + i) + j] += (gone - dt) * f[c + N * (DV + i) + j]
+                f[c + N * (DV + i) + j] *= e
+        for i in range(N):
+            for j in range(i):
+                swap = f[c + N * i + j]
+                f[c + N * i + j] = f[c + N * j + i]
+                f[c + N * j + i] = swap
+    q = noise * noise
+    for i in range(3):
+        f[c + (N + 1) * (DV + i)] += 0.5 * q * COAST_TIME * (1.0 - e * e)
+        cross = 0.5 * q * gone * gone
+        f[c + N * (DV + i) + DP + i] += cross
+        f[c + N * (DP + i) + DV + i] += cross
+        f[c + (N + 1) * (DP + i)] += q * COAST_TIME**2 * (dt - 2.0 * gone + 0.5 * COAST_TIME * (1.0 - e * e))
 
 
 @_jit
 def update(f, H, y, R):
-    """Kalman update of the filter f (BLOCK,) with innovation y (m,), H (m, 18), R (m, m). False: S is not positive.
+    """Kalman update of the filter f (BLOCK,) with innovation y (m,), H (m, N), R (m, m). False: S is not positive.
 
     P - K S Kᵀ with K S Kᵀ = Wᵀ W, W = L⁻¹ H P, S = L Lᵀ: symmetric as it is computed. The state then moves by the
     error dx, and P is expressed in the error about the new state: with R̂⁺ = R̂ Exp(δθ̂), the new error is
@@ -448,7 +525,7 @@ def update(f, H, y, R):
     # J P Jᵀ as J (J P)ᵀ, the second round for the first nine columns only, as in `predict`. There only the mean of P
     # and Pᵀ is kept: without that the rounding of a few minutes grows into a P that is none.
     for second in range(2):
-        for j in range(N - 9 * second):
+        for j in range(9 if second else N):
             for block in range(3):
                 n = min(block, 1)
                 r = c + 3 * N * block + j
@@ -595,6 +672,7 @@ def _start(f, prm, fix, k, afresh):
         f[c + (N + 1) * DTD] = prm[TIME_OFFSET_SIGMA] ** 2
         for i in range(2):
             f[c + (N + 1) * (DTILT + i)] = prm[TILT_SIGMA] ** 2
+            f[c + (N + 1) * (DWHEEL + i)] = prm[WHEEL_SCALE_SIGMA] ** 2
     for i in range(DBG):
         for j in range(N):
             f[c + N * i + j] = 0.0
@@ -615,6 +693,14 @@ def _start(f, prm, fix, k, afresh):
                 for n in range(3):
                     total += B[m, i % 3] * fix[k + H_COV + 6 * (3 * (i // 3) + m) + 3 * (j // 3) + n] * B[n, j % 3]
             f[c + N * (DP - 6 * (i // 3) + i % 3) + DP - 6 * (j // 3) + j % 3] = total
+    most = UNKNOWN_HEADING * UNKNOWN_HEADING
+    if max(f[c], f[c + N + 1], f[c + 2 * (N + 1)]) > most:
+        # The fix says nothing of the attitude.
+        for i in range(3):
+            for j in range(N):
+                f[c + N * i + j] = 0.0
+                f[c + N * j + i] = 0.0
+            f[c + (N + 1) * i] = most
 
 
 @_jit
@@ -701,6 +787,20 @@ def _adapt(s, prm, figures, most):
 
 
 @_jit
+def _restarted(s, prm, fix, count):
+    """The pose has been set anew, by `count` fixes of which this is the last."""
+    s[ACCEPTED_COUNT] = count
+    s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
+    s[RESET_ID] += 1.0
+    s[T_ACCEPTED] = s[T]
+    # It may be the clocks that have jumped.
+    for i in range(N):
+        s[COV + N * DTD + i] = s[COV + N * i + DTD] = 0.0
+    s[COV + (N + 1) * DTD] = prm[TIME_OFFSET_SIGMA] * prm[TIME_OFFSET_SIGMA]
+    fix[F_OUTCOME] = REINIT
+
+
+@_jit
 def _judge(s, prm, fix):
     """Believe a fix, or not: update the filter at T, and say in the fix's row what became of it.
 
@@ -711,10 +811,15 @@ def _judge(s, prm, fix):
     long without an accepted one, set the filter anew from the last: it is never locked out for good.
     """
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    fix[F_OUTCOME] = REJECTED
     shadows = s[SHADOW_COUNT] > 0.0
-    agrees = False
+    agrees, partly = False, False
     figures = np.empty(F_REPORTED - F_D2)
+    if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
+        # After so long without an IMU nothing is left to weigh the fix by.
+        _weigh(s, MAIN, prm, fix, H, y, R, S)
+        _start(s[:BLOCK], prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, False)
+        _restarted(s, prm, fix, 1.0)
+        return
     for o in range(MAIN, SHADOW + 1 if shadows else SHADOW, BLOCK):
         _weigh(s, o, prm, fix, H, y, R, S)
         blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
@@ -738,6 +843,14 @@ def _judge(s, prm, fix):
                 s[STILL_BARRED] = s[T] + STILL_PAUSE
             fix[F_OUTCOME] = INFLATED if ratio > 1.0 else ACCEPTED
         if ratio > prm[GATE_INFLATION]:
+            if o == MAIN and fix[F_D2_POSITION] <= prm[GATE_BLOCK]:
+                # A marker that is turned in the map, or seen flipped, is still where it is.
+                for i in range(6):
+                    for j in range(3, 6):
+                        R[i, j] = R[j, i] = 0.0
+                for i in range(3, 6):
+                    R[i, i] = UNKNOWN_HEADING * UNKNOWN_HEADING
+                partly = update(s[:BLOCK], H, y, R)
             continue
         if o == MAIN:
             _adapt(s, prm, figures, MOST_TAUGHT)
@@ -751,9 +864,18 @@ def _judge(s, prm, fix):
                 s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
                 s[ACCEPTED_COUNT] += 1.0
                 s[T_ACCEPTED] = s[T]
+                n = min(s[PLACE_COUNT] + 1.0, PLACE_FIXES)
+                s[PLACE_COUNT] = n
+                for i in range(3):
+                    off = s[POS + i] - s[PLACE + i]
+                    s[PLACE + i] += off / n
+                    s[PLACE2 + i] += (off * off * (n - 1.0) / n - s[PLACE2 + i]) / n
                 return
             agrees = True
     fix[F_OUTCOME] = REJECTED
+    if partly:
+        fix[F_OUTCOME] = INFLATED
+        s[T_ACCEPTED] = s[T]
     _fill(fix[F_D2:F_REPORTED], figures)
     # A reject that is not far off, that agrees with the one before, or is one of many, is no outlier: something is
     # noisier than it says. Unless it is turned, as flips are.
@@ -788,14 +910,10 @@ def _judge(s, prm, fix):
         _start(s[SHADOW:AUX], prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
         s[SHADOW_COUNT] = 1.0
         # Not even with each other do they agree, so many in a row: then any is better than none of them.
-        take = patient or (s[REJECTED_RUN] >= 2.0 * prm[REINIT_COUNT] and not turned)
+        take = patient or (s[REJECTED_RUN] >= 2.0 * prm[REINIT_COUNT] and not (turned and partly))
     if take:
         _fill(s[:SHADOW], s[SHADOW:])
-        s[ACCEPTED_COUNT] = s[SHADOW_COUNT]
-        s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
-        s[RESET_ID] += 1.0
-        s[T_ACCEPTED] = s[T]
-        fix[F_OUTCOME] = REINIT
+        _restarted(s, prm, fix, s[SHADOW_COUNT])
 
 
 @_jit
@@ -860,7 +978,7 @@ def _watch(s, prm, imu, meta, k):
 @_jit
 def _loosened(variance, nis, y):
     """The variance of a constraint that was violated by nis on the mean of late, and is by y now."""
-    return max(variance * max(nis, 1.0), y * y)
+    return max(variance * max(nis, LEAST_CONSTRAINT), y * y)
 
 
 @_jit
@@ -869,15 +987,20 @@ def _constrain(s, prm):
 
     At rest: no velocity, no rate. On the floor: no vertical speed, upright; on wheels: no sideways speed either. Each
     of these is loosened by how much it has been violated of late. Always: robots do not go faster than they usually
-    do, by which a speed that nothing measures any more decays instead of being integrated for ever.
+    do, by which a speed that nothing measures any more decays instead of being integrated for ever; nor, when no fix
+    comes, do they leave for good the place where they have been.
     """
     B = np.empty((3, 3))
-    still = s[STILL_SINCE] <= s[T] - (STILL_AFTER if s[STILL_SURE] > 0.0 else 2.0 * STILL_AFTER)
+    still = s[T] - s[T_IMU] <= prm[IMU_GAP] and s[STILL_SINCE] <= s[T] - (
+        STILL_AFTER if s[STILL_SURE] > 0.0 else 2.0 * STILL_AFTER
+    )
     still_sigma = STILL_SPEED_SIGMA if s[STILL_SURE] > 0.0 else 3.0 * STILL_SPEED_SIGMA
     wheels = prm[MOTION] == DIFFERENTIAL
     for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
         m, sideways = 0, 0
-        H, y, variances = np.zeros((9, N)), np.zeros(9), np.empty(9)
+        if prm[TIME_OFFSET_SIGMA] > 0.0:
+            s[o + COV + (N + 1) * DTD] += TIME_OFFSET_WALK * TIME_OFFSET_WALK / GRID_HZ
+        H, y, variances = np.zeros((12, N)), np.zeros(12), np.empty(12)
         _matrix(s[o:], B)
         # along body axes: v_b = Rᵀv, δv_b = δv + [v_b]x δθ
         body = np.zeros(3)
@@ -901,6 +1024,13 @@ def _constrain(s, prm):
             H[m, (i + 1) % 3] = -body[(i + 2) % 3]
             H[m, (i + 2) % 3] = body[(i + 1) % 3]
             m += 1
+        if s[T] - s[T_ACCEPTED] > COAST_TIME and s[PLACE_COUNT] > 10.0:
+            for i in range(3):
+                y[m] = s[PLACE + i] - s[o + POS + i]
+                for j in range(3):
+                    H[m, DP + j] = B[i, j]
+                variances[m] = max(s[PLACE2 + i], LEAST_PLACE * LEAST_PLACE) * 2.0 * PLACE_TIME * GRID_HZ
+                m += 1
         if still:
             sigma = 2.0 * prm[GYRO_NOISE] * math.sqrt(GRID_HZ)
             for i in range(3):
@@ -920,7 +1050,8 @@ def _constrain(s, prm):
             H[m, 1], H[m, 2] = -B[2, 2], B[2, 1]
             H[m + 1, 0], H[m + 1, 2] = B[2, 2], -B[2, 0]
             for i in range(1, 3):
-                variances[m] = _loosened(prm[GROUND_TILT_SIGMA] ** 2, s[CONSTRAINT_NIS + i], y[m])
+                # not tightened: who leans, leans always
+                variances[m] = _loosened(prm[GROUND_TILT_SIGMA] ** 2, max(s[CONSTRAINT_NIS + i], 1.0), y[m])
                 m += 1
         if o == MAIN and prm[MOTION] != FREE and not still:
             first = m - 3
@@ -931,7 +1062,7 @@ def _constrain(s, prm):
                     for d in range(DP):
                         expected += H[a, c] * s[COV + N * c + d] * H[a, d]
                 # relative to the constraint as it was meant
-                loose = max(s[CONSTRAINT_NIS + i], 1.0)
+                loose = max(s[CONSTRAINT_NIS + i], 1.0 if i == 1 or i == 2 else LEAST_CONSTRAINT)
                 s[CONSTRAINT_NIS + i] += 0.05 * (min(y[a] * y[a] / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
         if m > 0:
             R = np.zeros((m, m))
@@ -940,22 +1071,136 @@ def _constrain(s, prm):
             update(s[o : o + BLOCK], H[:m], y[:m], R)
 
 
+@_jit
+def _odometry(s, prm, reading):
+    """Take a reading of the wheels at T: forward speed and yaw rate of the body, each with an error of scale.
+
+        y_v = z_v - (1 + s_v) e_xᵀR̂ᵀv̂,    y_ω = z_ω - (1 + s_ω) (ω_z - b_z)
+
+    Loosened as constraints are: wheels slip. NaN: the robot does not tell. Without an IMU their yaw rate turns it.
+    """
+    B = np.empty((3, 3))
+    # What wheels get wrong they get wrong for a while: a second of them tells the same at whatever rate.
+    share = max(1.0 / (GRID_HZ * max(s[T] - s[T_WHEEL], 1e-3)), 1.0)
+    s[T_WHEEL] = s[T]
+    s[WHEEL_RATE] = 0.0 if math.isnan(reading[2]) else reading[2] / (1.0 + s[WHEEL + 1])
+    for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
+        _matrix(s[o:], B)
+        m = 0
+        H, y, variances = np.zeros((2, N)), np.zeros(2), np.empty(2)
+        for i in range(2):
+            if math.isnan(reading[1 + i]) or (i == 1 and s[BRIDGING] > 0.0):
+                continue
+            scale = 1.0 + s[o + WHEEL + i]
+            if i == 0:
+                body = np.zeros(3)
+                for j in range(3):
+                    body[j] = B[0, j] * s[o + V] + B[1, j] * s[o + V + 1] + B[2, j] * s[o + V + 2]
+                value = body[0]
+                H[m, DV] = scale
+                H[m, TH + 1], H[m, TH + 2] = -scale * body[2], scale * body[1]
+            else:
+                value = s[U + 2] - s[o + BG + 2]
+                H[m, DBG + 2] = -scale
+            H[m, DWHEEL + i] = value
+            y[m] = reading[1 + i] - scale * value
+            variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share
+            variances[m] = _loosened(variance, max(s[WHEEL_NIS + i], 1.0), y[m])
+            if o == MAIN:
+                expected = variances[m]
+                for c in range(N):
+                    for d in range(N):
+                        expected += H[m, c] * s[COV + N * c + d] * H[m, d]
+                loose = max(s[WHEEL_NIS + i], 1.0)
+                s[WHEEL_NIS + i] += 0.05 / share * (min(y[m] * y[m] / expected, 9.0) * loose - s[WHEEL_NIS + i])
+            m += 1
+        if m > 0:
+            R = np.zeros((m, m))
+            for i in range(m):
+                R[i, i] = variances[i]
+            update(s[o : o + BLOCK], H[:m], y[:m], R)
+
+
+@_inline
+def _grid(s, prm):
+    """The pseudo-measurements, where T has come to the next step of their grid."""
+    step = math.floor(s[T] * GRID_HZ)
+    if step != s[GRID_AT]:
+        s[GRID_AT] = step
+        if s[INITIALISED] > 0.0:
+            _constrain(s, prm)
+
+
 # -------------------------------------------------------------------------------------------------------- timeline
 
 
+@_inline
+def _next_sample(s, prm, imu, k):
+    """Set the state on its way to IMU sample number k, as far as that can be believed.
+
+    A pause is bridged, and a sensor that repeats itself to the last digit is one; what is more than the sensor can say,
+    and a sample that is far from the one before, alone, are as good as nothing.
+    """
+    row = k & IMU_MASK
+    t = imu[row, 0]
+    s[NEXT_T] = t
+    # Whether a pause is bridged depends on the stamps of the IMU alone, not on the fixes within it.
+    s[BRIDGING] = 1.0 if t - s[T_IMU] > prm[IMU_GAP] else 0.0
+    gyro, accel = 0.0, 0.0
+    saturated = False
+    for i in range(6):
+        s[NEXT_U + i] = imu[row, 1 + i]
+        change = s[NEXT_U + i] - s[U + i]
+        if i < 3:
+            gyro += change * change
+        else:
+            accel += change * change
+        if change == 0.0 and abs(s[U + i]) >= max(
+            s[LARGEST_GYRO + i // 3], SATURATED_GYRO if i < 3 else SATURATED_ACCEL
+        ):
+            s[CLIPPED + i // 3] += 1.0
+            saturated |= s[CLIPPED + i // 3] >= CLIPPED_OFTEN
+    s[SAME_RUN] = s[SAME_RUN] + 1.0 if gyro + accel == 0.0 else 0.0
+    if s[SAME_RUN] >= STUCK_AFTER:
+        s[BRIDGING] = 1.0
+    spike = gyro > max(SPIKE * SPIKE * s[CHANGE_GYRO], SPIKE_GYRO * SPIKE_GYRO)
+    spike |= accel > max(SPIKE * SPIKE * s[CHANGE_ACCEL], SPIKE_ACCEL * SPIKE_ACCEL)
+    impossible = gyro > IMPOSSIBLE_GYRO * IMPOSSIBLE_GYRO or accel > IMPOSSIBLE_ACCEL * IMPOSSIBLE_ACCEL
+    if impossible or (spike and s[SUSPECT] == 0.0 and s[LARGEST_ACCEL] > 0.0):
+        s[SUSPECT] = 1.0
+        for i in range(6):
+            s[NEXT_U + i] = s[U + i]
+    else:
+        s[SUSPECT] = 0.0
+        if s[LARGEST_ACCEL] > 0.0:
+            s[CHANGE_GYRO] += 0.02 * (gyro - s[CHANGE_GYRO])
+            s[CHANGE_ACCEL] += 0.02 * (accel - s[CHANGE_ACCEL])
+        for i in range(6):
+            if abs(s[NEXT_U + i]) > s[LARGEST_GYRO + i // 3]:
+                s[LARGEST_GYRO + i // 3] = abs(s[NEXT_U + i])
+                s[CLIPPED + i // 3] = 0.0
+    s[BLIND] = 1.0 if saturated or s[SUSPECT] > 0.0 else 0.0
+
+
 @_jit
-def _run_to(s, prm, fixes, fix_end, t_end):
-    """Carry the state to t_end, on its way to the next sample, and take all fixes due until then at their instants."""
+def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
+    """Carry the state to t_end, on its way to the next sample, and take all that is due until then at its instant."""
     while True:
         cursor = int(s[FIX_CURSOR])
         t = t_end
-        due = False
+        due = NOTHING
         if cursor < fix_end:
             t_fix = fixes[cursor & FIX_MASK, F_T] + s[TD_APPLIED]
             if t_fix <= t_end:
-                t, due = t_fix, True
+                t, due = t_fix, A_FIX
+        wheel = int(s[WHEEL_CURSOR])
+        if wheel < wheel_end and wheels[wheel & WHEEL_MASK, 0] <= t:
+            t, due = wheels[wheel & WHEEL_MASK, 0], A_READING
         # An offset that has just shrunk can put a fix before the one before it, by its change: it is taken now.
         dt = t - s[T]
+        if s[BRIDGING] > 0.0:
+            # after longer than that nothing is known any less
+            dt = min(dt, MOST_BRIDGED)
         if dt > 0.0:
             # the input at t, on the line from the state's to the next sample's; its mean on the way there
             part = 1.0
@@ -969,6 +1214,9 @@ def _run_to(s, prm, fixes, fix_end, t_end):
                 ay = s[U + 4] + 0.5 * part * (s[NEXT_U + 4] - s[U + 4])
                 az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
                 rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
+                if s[BLIND] > 0.0:
+                    # anything up to several times what it has ever said
+                    rate_noise, force_noise = s[LARGEST_GYRO] * BLIND_TIME, s[LARGEST_ACCEL] * BLIND_TIME
                 for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
                     if s[BRIDGING] > 0.0:
                         # Straight on: the input that says so is the bias, and gravity seen from the body.
@@ -976,17 +1224,24 @@ def _run_to(s, prm, fixes, fix_end, t_end):
                         c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
                         w, x, y, z = s[o], s[o + 1], s[o + 2], s[o + 3]
                         gx, gy, gz = s[o + BG], s[o + BG + 1], s[o + BG + 2]
+                        turns = t - s[T_WHEEL] <= prm[IMU_GAP]
+                        if turns:
+                            gz += s[WHEEL_RATE]
                         ax = (1.0 - 2.0 * (y * y + z * z)) * c0 + 2.0 * ((x * y + w * z) * c1 + (x * z - w * y) * c2)
                         ay = (1.0 - 2.0 * (x * x + z * z)) * c1 + 2.0 * ((x * y - w * z) * c0 + (y * z + w * x) * c2)
                         az = (1.0 - 2.0 * (x * x + y * y)) * c2 + 2.0 * ((x * z + w * y) * c0 + (y * z - w * x) * c1)
                         ax = GRAVITY * ax + s[o + BA]
                         ay = GRAVITY * ay + s[o + BA + 1]
                         az = GRAVITY * az + s[o + BA + 2]
-                        rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], prm[NO_IMU_ACCEL_NOISE]
+                        rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
+                        if turns:
+                            rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
                     predict(
                         s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt,
                         rate_noise, force_noise, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK],
                     )  # fmt: skip
+                    if s[BRIDGING] > 0.0:
+                        _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
             if part == 1.0:
                 for i in range(6):
                     s[U + i] = s[NEXT_U + i]
@@ -994,16 +1249,24 @@ def _run_to(s, prm, fixes, fix_end, t_end):
                 for i in range(6):
                     s[U + i] += part * (s[NEXT_U + i] - s[U + i])
             s[T] = t
-        if not due:
+        if due == NOTHING:
             return
-        fix = fixes[cursor & FIX_MASK]
-        if s[INITIALISED] > 0.0:
-            _judge(s, prm, fix)
+        if due == A_READING:
+            if s[INITIALISED] > 0.0:
+                _odometry(s, prm, wheels[wheel & WHEEL_MASK])
+            s[WHEEL_CURSOR] = wheel + 1
         else:
-            _initialise(s, prm, fix)
-            fix[F_OUTCOME] = INIT
-        s[TD_APPLIED] = s[TD]
-        s[FIX_CURSOR] = cursor + 1
+            fix = fixes[cursor & FIX_MASK]
+            if s[INITIALISED] > 0.0:
+                _judge(s, prm, fix)
+            else:
+                _initialise(s, prm, fix)
+                fix[F_OUTCOME] = INIT
+            s[TD_APPLIED] = s[TD]
+            s[FIX_CURSOR] = cursor + 1
+        if s[BRIDGING] > 0.0:
+            # no sample may come to do it
+            _grid(s, prm)
 
 
 @_jit
@@ -1030,32 +1293,34 @@ def _keep_checkpoint(s, prm, checkpoints, meta):
 
 
 @_jit
-def _advance(s, prm, imu, fixes, checkpoints, meta, until, live):
+def _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live):
     """Bring a state up to the inputs in the rings that are stamped until then, and the live one with checkpoints."""
     k = int(s[IMU_CURSOR])
-    imu_end, fix_end = int(meta[IMU_END]), int(meta[FIX_END])
+    imu_end, fix_end, wheel_end = int(meta[IMU_END]), int(meta[FIX_END]), int(meta[WHEEL_END])
     while True:
         row = k & IMU_MASK
         if k < imu_end and imu[row, 0] <= until:
             t, trailing = imu[row, 0], 0.0
-            for i in range(7):
-                s[NEXT_T + i] = imu[row, i]
-            # Whether a pause is bridged depends on the stamps of the IMU alone, not on the fixes within it.
-            s[BRIDGING] = 1.0 if t - s[T_IMU] > prm[IMU_GAP] else 0.0
-        elif live and s[FIX_CURSOR] < fix_end and meta[HORIZON] > s[T_IMU] + prm[IMU_GAP]:
-            # Fixes beyond the last sample wait for the IMU, unless it has been silent for too long.
-            t, trailing = fixes[int(s[FIX_CURSOR]) & FIX_MASK, F_T] + s[TD_APPLIED], 1.0
+            _next_sample(s, prm, imu, k)
+        elif live and meta[HORIZON] > s[T_IMU] + prm[IMU_GAP]:
+            # What is beyond the last sample waits for the IMU, unless that has been silent for too long.
+            t, trailing = math.inf, 1.0
+            if s[FIX_CURSOR] < fix_end:
+                t = fixes[int(s[FIX_CURSOR]) & FIX_MASK, F_T] + s[TD_APPLIED]
+            if s[WHEEL_CURSOR] < wheel_end:
+                t = min(t, wheels[int(s[WHEEL_CURSOR]) & WHEEL_MASK, 0])
+            if t == math.inf:
+                break
             s[NEXT_T] = math.inf
             s[BRIDGING] = 1.0
         else:
             break
-        _run_to(s, prm, fixes, fix_end, t)
+        _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t)
         s[TRAILING] = trailing
         if trailing == 0.0:
             if s[INITIALISED] > 0.0:
-                if math.floor(t * GRID_HZ) != math.floor(s[T_IMU] * GRID_HZ):
+                if math.floor(t * GRID_HZ) != s[GRID_AT]:
                     _watch(s, prm, imu, meta, k)
-                    _constrain(s, prm)
             else:
                 # mean over the last hundred samples or so
                 n = min(s[ACCEL_COUNT] + 1.0, 100.0)
@@ -1063,6 +1328,7 @@ def _advance(s, prm, imu, fixes, checkpoints, meta, until, live):
                 for i in range(3):
                     s[ACCEL_MEAN + i] += (imu[row, 4 + i] - s[ACCEL_MEAN + i]) / n
             s[T_IMU] = t
+            _grid(s, prm)
             k += 1
             s[IMU_CURSOR] = k
         if live:
@@ -1083,11 +1349,16 @@ def _precedes_fix(s, t, place):
 
 @_jit
 def _rewind(s, prm, checkpoints, meta, t, place):
-    """Load the newest checkpoint before a sample stamped t (place < 0) or fix number `place`. False: there is none."""
+    """Load the newest checkpoint before something stamped t: fix number `place`, a sample (-1) or a reading of the
+    wheels (-2). False: there is none."""
     number = int(meta[CP_END]) - 1
     while number >= meta[CP_FIRST]:
         checkpoint = checkpoints[number & CP_MASK]
-        if _precedes_sample(checkpoint, t, prm[IMU_GAP]) if place < 0 else _precedes_fix(checkpoint, t, place):
+        if place >= 0.0:
+            precedes = _precedes_fix(checkpoint, t, place)
+        else:
+            precedes = _precedes_sample(checkpoint, t, prm[IMU_GAP]) if place == -1.0 else checkpoint[T] < t
+        if precedes:
             break
         number -= 1
     if number < meta[CP_FIRST] or t < meta[HORIZON] - prm[BUFFER]:
@@ -1100,50 +1371,66 @@ def _rewind(s, prm, checkpoints, meta, t, place):
 
 @_jit
 def _drop_orphans(checkpoints, meta):
-    """Drop the checkpoints that would need a sample or a fix that has left its ring."""
+    """Drop the checkpoints that would need what has left its ring."""
     while meta[CP_FIRST] < meta[CP_END]:
         oldest = checkpoints[int(meta[CP_FIRST]) & CP_MASK]
-        if oldest[IMU_CURSOR] >= meta[IMU_FIRST] and oldest[FIX_CURSOR] >= meta[FIX_FIRST]:
+        enough = oldest[IMU_CURSOR] >= meta[IMU_FIRST] and oldest[FIX_CURSOR] >= meta[FIX_FIRST]
+        if enough and oldest[WHEEL_CURSOR] >= meta[WHEEL_FIRST]:
             break
         meta[CP_FIRST] += 1.0
 
 
-@_inline
-def _insert_sample(s, prm, imu, checkpoints, meta, samples, row):
-    """Put samples[row] in its place in the ring, and rewind the state if it is not at the end. False: dropped."""
-    t = samples[row, 0]
-    first, end = int(meta[IMU_FIRST]), int(meta[IMU_END])
+@_jit
+def _plausible(meta, prm, t):
+    """Whether a stamp may be true. One of the far future would make everything after it too late; two are a pause."""
+    if not t > meta[HORIZON] + FAR_AHEAD or meta[HORIZON] == -math.inf or abs(t - meta[AHEAD]) <= prm[BUFFER]:
+        return True
+    meta[AHEAD] = t
+    return False
+
+
+@_jit
+def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
+    """Put a reading of the IMU, or of the wheels, in its place in the ring, and rewind the state if need be.
+
+    `counters`: meta from the ring's own on: first, end; then repeated and late ones. False: it was dropped.
+    """
+    t = reading[0]
+    if not _plausible(meta, prm, t):
+        meta[IMU_LATE if imu else WHEEL_LATE] += 1.0
+        return False
+    width, mask = ring.shape[1], ring.shape[0] - 1
+    first, end = int(meta[counters]), int(meta[counters + 1])
     place = end
-    while place > first and imu[(place - 1) & IMU_MASK, 0] > t:
+    while place > first and ring[(place - 1) & mask, 0] > t:
         place -= 1
     replaces = False
-    if place > first and imu[(place - 1) & IMU_MASK, 0] == t:
+    if place > first and ring[(place - 1) & mask, 0] == t:
         # The same stamp twice: one is kept, and which one must not depend on the order of arrival.
-        meta[IMU_DUPLICATES] += 1.0
-        for i in range(1, 7):
-            if samples[row, i] != imu[(place - 1) & IMU_MASK, i]:
-                replaces = samples[row, i] < imu[(place - 1) & IMU_MASK, i]
+        meta[IMU_DUPLICATES if imu else WHEEL_DUPLICATES] += 1.0
+        for i in range(1, width):
+            if reading[i] != ring[(place - 1) & mask, i]:
+                replaces = reading[i] < ring[(place - 1) & mask, i]
                 break
         if not replaces:
             return False
-    if (replaces or place < end or not _precedes_sample(s, t, prm[IMU_GAP])) and not _rewind(
-        s, prm, checkpoints, meta, t, -1.0
-    ):
-        meta[IMU_LATE] += 1.0
+    in_order = _precedes_sample(s, t, prm[IMU_GAP]) if imu else s[T] < t
+    if (replaces or place < end or not in_order) and not _rewind(s, prm, checkpoints, meta, t, -1.0 if imu else -2.0):
+        meta[IMU_LATE if imu else WHEEL_LATE] += 1.0
         return False
     if replaces:
         place -= 1
     else:
         for k in range(end, place, -1):
-            for i in range(7):
-                imu[k & IMU_MASK, i] = imu[(k - 1) & IMU_MASK, i]
+            for i in range(width):
+                ring[k & mask, i] = ring[(k - 1) & mask, i]
         end += 1
-    for i in range(7):
-        imu[place & IMU_MASK, i] = samples[row, i]
-    meta[IMU_END] = end
+    for i in range(width):
+        ring[place & mask, i] = reading[i]
+    meta[counters + 1] = end
     meta[HORIZON] = max(meta[HORIZON], t)
-    if end - first == IMU_CAPACITY:
-        meta[IMU_FIRST] = first + 1
+    if end - first == mask + 1:
+        meta[counters] = first + 1
         _drop_orphans(checkpoints, meta)
     return True
 
@@ -1151,6 +1438,8 @@ def _insert_sample(s, prm, imu, checkpoints, meta, samples, row):
 @_jit
 def _insert_fix(s, prm, fixes, checkpoints, meta, fix):
     """Put a fix in its place, by stamp, then by content, and rewind if need be. -> PENDING, TOO_LATE or DUPLICATE."""
+    if not _plausible(meta, prm, fix[F_T]):
+        return TOO_LATE
     first, end = int(meta[FIX_FIRST]), int(meta[FIX_END])
     place = end
     while place > first:
@@ -1316,7 +1605,7 @@ def _absorb(s, ch, plain):
 
 # ----------------------------------------------------------------------------------------------- called from Python
 
-FEED_SAMPLES, FEED_FIX, POSE_AT = range(3)
+FEED_SAMPLES, FEED_FIX, FEED_WHEELS, POSE_AT = range(4)
 BEST, SMOOTH = 0, 1
 
 
@@ -1328,6 +1617,7 @@ def process(memory, task, channel, t, inputs, outputs):
     FEED_SAMPLES: `inputs` (n, 7) are IMU samples; into `outputs` (n, 8), or (0, 8), goes the newest pose after each:
     its instant, which is the sample's stamp unless that came late, position, quaternion wxyz, NaN before the start.
     -> number of samples kept.
+    FEED_WHEELS: `inputs` (n, 3) are readings of the wheels: t, forward speed, yaw rate. -> number of those kept.
     FEED_FIX: `inputs` (1, FIX). -> PENDING, TOO_LATE or DUPLICATE; how it was judged stands in its row of the ring.
     POSE_AT: `outputs` (1, POSE) is the pose at `t`, from all inputs so far. -> 0 before the start and the buffer.
     """
@@ -1336,19 +1626,21 @@ def process(memory, task, channel, t, inputs, outputs):
     c = b + STATE
     ch = carray(_pointer(memory + 8 * c), CHANNEL)
     c += CHANNEL
-    d = c + IMU_CAPACITY * 7
-    e = d + FIX_CAPACITY * FIX
+    d = c + IMU_CAPACITY * IMU_ROW
+    g = d + FIX_CAPACITY * FIX
+    e = g + WHEEL_CAPACITY * WHEEL_ROW
     meta, prm = carray(_pointer(memory), META), carray(_pointer(memory + 8 * a), PARAMS)
     state = carray(_pointer(memory + 8 * b), STATE)
-    imu = carray(_pointer(memory + 8 * c), (IMU_CAPACITY, 7))
+    imu = carray(_pointer(memory + 8 * c), (IMU_CAPACITY, IMU_ROW))
     fixes = carray(_pointer(memory + 8 * d), (FIX_CAPACITY, FIX))
+    wheels = carray(_pointer(memory + 8 * g), (WHEEL_CAPACITY, WHEEL_ROW))
     checkpoints = carray(_pointer(memory + 8 * e), (CP_CAPACITY, STATE))
 
     answer = 0
     s = state
     live = task != POSE_AT
     until = math.inf
-    fix_end = 0
+    fix_end, wheel_end = 0, 0
     if not live:
         until = t
         number = int(meta[CP_END]) - 1
@@ -1359,7 +1651,7 @@ def process(memory, task, channel, t, inputs, outputs):
         elif number >= meta[CP_FIRST]:
             # The rows of its fixes are written again, with the same figures.
             s = checkpoints[number & CP_MASK].copy()
-            fix_end = int(meta[FIX_END])
+            fix_end, wheel_end = int(meta[FIX_END]), int(meta[WHEEL_END])
         else:
             return 0
     for i in range(inputs.shape[0] if live else 1):
@@ -1376,11 +1668,14 @@ def process(memory, task, channel, t, inputs, outputs):
             for j in range(6):
                 ch[BEFORE_CORRECTED + j] = state[CORRECTED + j]
         if task == FEED_SAMPLES:
-            if _insert_sample(state, prm, imu, checkpoints, meta, inputs, i):
+            if _insert_row(state, prm, imu, IMU_FIRST, checkpoints, meta, inputs[i], True):
+                answer += 1
+        elif task == FEED_WHEELS:
+            if _insert_row(state, prm, wheels, WHEEL_FIRST, checkpoints, meta, inputs[i], False):
                 answer += 1
         elif task == FEED_FIX:
             answer = _insert_fix(state, prm, fixes, checkpoints, meta, inputs[i])
-        _advance(s, prm, imu, fixes, checkpoints, meta, until, live)
+        _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live)
         if live and started:
             _absorb(state, ch, meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor)
         elif live:
@@ -1402,17 +1697,15 @@ def process(memory, task, channel, t, inputs, outputs):
     for leg in range(1 if between else 2):
         t_leg = t
         if between:
-            _fill(s[NEXT_T : NEXT_T + 7], imu[k & IMU_MASK])
-            s[BRIDGING] = 1.0 if s[NEXT_T] - s[T_IMU] > prm[IMU_GAP] else 0.0
+            _next_sample(s, prm, imu, k)
         else:
             s[NEXT_T] = math.inf
             _fill(s[NEXT_U : NEXT_U + 6], s[U:])
-            # Later than that nothing is known, and the pose stays where it was.
-            t_leg = min(t, s[T] + SPEED_TIME) if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
+            t_leg = t if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
         if t_leg > s[T] and s[INITIALISED] + fix_end > 0.0:
             if not between:
                 s[BRIDGING] = leg
-            _run_to(s, prm, fixes, fix_end, t_leg)
+            _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_leg)
     if not s[INITIALISED] > 0.0:
         return 0
     out = outputs[0]
@@ -1437,14 +1730,15 @@ def process(memory, task, channel, t, inputs, outputs):
 
 def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
     """Meta, parameters, state, smooth channel, IMU ring, fix ring and checkpoint ring of one robot's memory."""
-    sizes = (META, PARAMS, STATE, CHANNEL, IMU_CAPACITY * 7, FIX_CAPACITY * FIX, CP_CAPACITY * STATE)
-    meta, prm, state, channel, imu, fixes, checkpoints = np.split(memory, np.cumsum(sizes)[:-1])
+    wheels = WHEEL_CAPACITY * WHEEL_ROW
+    sizes = (META, PARAMS, STATE, CHANNEL, IMU_CAPACITY * IMU_ROW, FIX_CAPACITY * FIX, wheels, CP_CAPACITY * STATE)
+    meta, prm, state, channel, imu, fixes, _, checkpoints = np.split(memory, np.cumsum(sizes)[:-1])
     return (
         meta,
         prm,
         state,
         channel,
-        imu.reshape(IMU_CAPACITY, 7),
+        imu.reshape(IMU_CAPACITY, IMU_ROW),
         fixes.reshape(FIX_CAPACITY, FIX),
         checkpoints.reshape(CP_CAPACITY, STATE),
     )
@@ -1452,14 +1746,15 @@ def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array, Arra
 
 def new_memory(parameters: Array) -> Array:
     """The memory of a robot that nothing is known of: empty rings, a blank state, and a checkpoint of it."""
-    memory = np.zeros(META + PARAMS + STATE + CHANNEL + IMU_CAPACITY * 7 + FIX_CAPACITY * FIX + CP_CAPACITY * STATE)
+    rings = IMU_CAPACITY * IMU_ROW + FIX_CAPACITY * FIX + WHEEL_CAPACITY * WHEEL_ROW + CP_CAPACITY * STATE
+    memory = np.zeros(META + PARAMS + STATE + CHANNEL + rings)
     meta, prm, state, channel, _, _, checkpoints = views(memory)
     prm[:] = parameters
-    meta[HORIZON] = state[T] = state[T_IMU] = state[T_ACCEPTED] = -math.inf
+    meta[AHEAD] = meta[HORIZON] = state[T] = state[T_IMU] = state[T_ACCEPTED] = state[T_WHEEL] = -math.inf
     channel[E_PUBLISHED] = -math.inf
     state[STILL_SINCE] = math.inf
-    state[STILL_BARRED] = state[T_ADAPTED] = -math.inf
-    state[SCALE : SCALE + 4] = 1.0
+    state[STILL_BARRED] = state[T_ADAPTED] = state[GRID_AT] = -math.inf
+    state[SCALE : SCALE + 4] = state[CONSTRAINT_NIS : CONSTRAINT_NIS + 4] = 1.0
     state[USUAL_SPEED2] = prm[USUAL_SPEED] ** 2
     checkpoints[0] = state
     meta[CP_END] = 1.0

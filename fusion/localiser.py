@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from fusion import kernels as k
-from fusion.measurements import Array, FixOutcome, ImuBatch, Mode, Outcome, Pose, PoseFix
+from fusion.measurements import Array, FixOutcome, ImuBatch, Mode, Outcome, Pose, PoseFix, WheelOdometry
 from fusion.params import Channel, Engine, FilterParams, Motion
 from fusion.timeline import Timeline, fix_row
 
@@ -18,6 +18,7 @@ class _Timeline(Protocol):
     def state(self) -> Array: ...
     def feed_samples(self, samples: Array, track: Array | None = None, channel: Channel = "best") -> int: ...
     def feed_fix(self, row: Array) -> int: ...
+    def feed_wheels(self, samples: Array) -> int: ...
     def judged(self) -> list[Array]: ...
     def pose_at(self, t: float, channel: Channel = "best") -> Array | None: ...
     @property
@@ -62,11 +63,11 @@ class Localiser:
         self.engine = engine
         self._timeline = _timeline(engine, self.params, motion)
         self._outcomes = dict.fromkeys(Outcome, 0)
-        self._samples = 0
+        self._samples = self._readings = 0
         self._sources: dict[tuple[float, float], str] = {}
 
     def feed(
-        self, measurement: ImuBatch | PoseFix, track: Array | None = None, channel: Channel = "best"
+        self, measurement: ImuBatch | PoseFix | WheelOdometry, track: Array | None = None, channel: Channel = "best"
     ) -> list[FixOutcome]:
         """Take a measurement. -> the fixes that were judged by this call.
 
@@ -76,6 +77,9 @@ class Localiser:
         """
         if isinstance(measurement, ImuBatch):
             self.feed_samples(measurement.samples, track, channel)
+        elif isinstance(measurement, WheelOdometry):
+            self._readings += len(measurement.samples)
+            self._timeline.feed_wheels(measurement.samples)
         else:
             status = self._timeline.feed_fix(fix_row(measurement))
             if status != k.PENDING:
@@ -120,10 +124,10 @@ class Localiser:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Fixes by outcome, and of IMU samples those fed, those dropped as repeated and as late; rewinds."""
+        """Fixes by outcome; of readings of IMU and wheels those fed, those dropped as repeated and as late; rewinds."""
         return (
             {outcome.name.lower(): n for outcome, n in self._outcomes.items() if outcome is not Outcome.PENDING}
-            | {"imu_samples": self._samples}
+            | {"imu_samples": self._samples, "wheel_samples": self._readings}
             | self._timeline.figures
         )
 
@@ -181,6 +185,16 @@ class Localiser:
     def tilt_covariance(self) -> Array:
         """(2, 2): of the tilt; 0 when it is held."""
         return self._covariance[k.DTILT : k.DTILT + 2, k.DTILT : k.DTILT + 2].copy()
+
+    @property
+    def wheel_scale(self) -> Array:
+        """(2,): by what share wheel odometry's forward speed and yaw rate say too much."""
+        return self._timeline.state[k.WHEEL : k.WHEEL + 2].copy()
+
+    @property
+    def wheel_scale_sigma(self) -> Array:
+        """(2,): 0 where it is held."""
+        return self._sigma(k.DWHEEL, 2)
 
     @property
     def noise_scale(self) -> Array:

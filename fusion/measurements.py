@@ -51,6 +51,30 @@ class ImuBatch:
 
 
 @dataclass(frozen=True, slots=True)
+class WheelOdometry:
+    """Consecutive readings of one robot's wheel odometry.
+
+    `samples`: (n, 3) float64: stamp in s, forward speed of the body's origin in m/s, yaw rate in rad/s (to the left);
+    NaN for one of the two that the robot does not tell; stamps need not be sorted.
+    Raises MeasurementError on a wrong shape, a number that is infinite, or a reading without a stamp or any content.
+    """
+
+    robot: str
+    arrival: float
+    samples: Array
+
+    def __post_init__(self) -> None:
+        samples = np.ascontiguousarray(self.samples, dtype=np.float64)
+        if samples.ndim != 2 or samples.shape[1] != 3:
+            raise MeasurementError(f"wheel odometry of shape {samples.shape}: (n, 3) is needed, t speed yaw_rate")
+        wrong = np.isinf(samples).any(axis=1) | np.isnan(samples[:, 0]) | np.isnan(samples[:, 1:]).all(axis=1)
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            raise MeasurementError(f"wheel odometry, reading {row} is not finite: {samples[row].tolist()}")
+        object.__setattr__(self, "samples", samples)
+
+
+@dataclass(frozen=True, slots=True)
 class PoseHypothesis:
     """One pose that explains what a camera saw.
 

@@ -79,6 +79,12 @@ class FilterParams(Struct, frozen=True, forbid_unknown_fields=True):
     askew is forced upright (handheld_mocap replayed as "ground": 1.07 deg RMSE, 0.30 deg with this)."""
     wheel_velocity_sigma: Positive = 0.03
     """m/s: sideways speed of a robot on wheels, ten times a second."""
+    wheel_speed_sigma: Positive = 0.03
+    """m/s: forward speed by wheel odometry, as if it came ten times a second."""
+    wheel_rate_sigma: Positive = 0.05
+    """rad/s: its yaw rate, likewise."""
+    wheel_scale_sigma: NotNegative = 0.05
+    """prior of the error of scale of each, as a share; 0 holds it at 0."""
     usual_speed: Positive = 0.7
     """m/s: root mean square of the speed along an axis while the robot moves, before it is learnt. A speed that nothing
     measures any more decays by it."""

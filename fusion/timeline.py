@@ -65,6 +65,10 @@ class Timeline:
         outputs = self._nothing if track is None else track
         return int(k.process(self._address, k.FEED_SAMPLES, CHANNELS[channel], 0.0, samples, outputs))
 
+    def feed_wheels(self, samples: Array) -> int:
+        """Readings of the wheels (n, 3): t, forward speed, yaw rate. -> how many were neither duplicates nor too late."""
+        return int(k.process(self._address, k.FEED_WHEELS, k.BEST, 0.0, samples, self._nothing))
+
     def feed_fix(self, row: Array) -> int:
         """A fix as `fix_row` makes it. -> `kernels.PENDING`, `TOO_LATE` or `DUPLICATE`."""
         status = int(k.process(self._address, k.FEED_FIX, k.BEST, 0.0, row[np.newaxis], self._nothing))
@@ -94,9 +98,11 @@ class Timeline:
 
     @property
     def figures(self) -> dict[str, int]:
-        """How many IMU samples were seen twice, or came too late; how often the past was done again."""
+        """How many readings were seen twice, or came too late; how often the past was done again."""
         return {
             "imu_duplicates": int(self._meta[k.IMU_DUPLICATES]),
             "imu_late": int(self._meta[k.IMU_LATE]),
+            "wheel_duplicates": int(self._meta[k.WHEEL_DUPLICATES]),
+            "wheel_late": int(self._meta[k.WHEEL_LATE]),
             "rewinds": int(self._meta[k.REWINDS]),
         }
