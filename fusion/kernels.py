@@ -87,13 +87,15 @@ LARGEST_GYRO, LARGEST_ACCEL = AUX + 71, AUX + 72  # magnitude along an axis
 SUSPECT = AUX + 73  # 1 where the last sample was held to be lost
 BLIND = AUX + 74  # 1 while what the IMU says is not what the robot does
 GRID_AT = AUX + 75  # number of the last step of the grid
+STILL_FORCE = AUX + 85  # m/s2: mean specific force since it is at rest (3)
+SYSTEMATIC = AUX + 88  # covariance of what the last fix taken had wrong in common with all others, world axes (36)
 CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
 PLACE = AUX + 76  # m: mean of where fixes have found it (3)
 PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (3)
 PLACE_COUNT = AUX + 82
 ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
 T_ADAPTED = AUX + 62  # s: the last of them
-STATE = AUX + 85
+STATE = AUX + 124
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -145,9 +147,10 @@ CHANNEL = BEFORE_CORRECTED + 6
 PARAMS = 33
 FREE, GROUND, DIFFERENTIAL = 0.0, 1.0, 2.0
 
-# --- A fix: stamp, arrival, number of hypotheses, then per hypothesis position, quaternion, covariance, misfit -----
+# --- A fix: stamp, arrival, number of hypotheses, then per hypothesis position, quaternion, covariance, misfit and
+# the part of the covariance that repeats from fix to fix
 F_T, F_ARRIVAL, F_COUNT, F_HYPOTHESES = 0, 1, 2, 3
-H_POS, H_QUAT, H_COV, H_MISFIT, HYPOTHESIS = 0, 3, 7, 43, 44
+H_POS, H_QUAT, H_COV, H_MISFIT, H_SYSTEMATIC, HYPOTHESIS = 0, 3, 7, 43, 44, 80
 F_OUTCOME = F_HYPOTHESES + 2 * HYPOTHESIS
 F_D2, F_D2_POSITION, F_D2_ATTITUDE, F_CHOSEN, F_MARGIN = (F_OUTCOME + i for i in range(1, 6))
 F_INNOVATION = F_OUTCOME + 6
@@ -196,10 +199,11 @@ ADAPTATION_HZ = 2.0  # fixes more often than this share their say in the noise
 NOTHING, A_FIX, A_READING = range(3)
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
-STILL_SPEED_SIGMA = 0.003  # m/s
+STILL_SPEED_SIGMA = 0.002  # m/s
 LEAVE_STILL = 9.35  # chi-square .975 at 3 degrees of freedom: a fix that is further off says that the robot moves
+STILL_PUSH = 0.1  # m/s2: less is drift, and what a floor gives under a robot that stands
 STILL_PAUSE = 2.0  # s: and for so long it is believed
-LEAST_CONSTRAINT = 0.02  # of a constraint's variance is believed where it is kept ever so well
+LEAST_CONSTRAINT = 0.005  # of a constraint's variance is believed where it is kept ever so well
 STUCK_AFTER = 8  # samples that repeat each other to the last digit: nobody measures
 SPIKE = 20.0  # times the usual change, and more than these: one sample alone is held to be lost
 SPIKE_GYRO, SPIKE_ACCEL = 3.0, 30.0  # rad/s, m/s2
@@ -724,6 +728,7 @@ def _initialise(s, prm, fix):
             for i in range(3, 5):
                 fix[chosen + H_COV + 7 * i] += UNKNOWN_TILT_SIGMA * UNKNOWN_TILT_SIGMA
     _start(s[:BLOCK], prm, fix, chosen, s[INITIALISED] == 0.0)
+    _fill(s[SYSTEMATIC : SYSTEMATIC + 36], fix[chosen + H_SYSTEMATIC :])
     s[INITIALISED] = 1.0
     s[ACCEPTED_COUNT] = 1.0
     s[T_ACCEPTED] = s[T]
@@ -797,6 +802,7 @@ def _restarted(s, prm, fix, count):
     for i in range(N):
         s[COV + N * DTD + i] = s[COV + N * i + DTD] = 0.0
     s[COV + (N + 1) * DTD] = prm[TIME_OFFSET_SIGMA] * prm[TIME_OFFSET_SIGMA]
+    _fill(s[SYSTEMATIC : SYSTEMATIC + 36], fix[F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS + H_SYSTEMATIC :])
     fix[F_OUTCOME] = REINIT
 
 
@@ -861,6 +867,10 @@ def _judge(s, prm, fix):
                     R[i, j] += (ratio - 1.0) * S[i, j]
         if update(s[o : o + BLOCK], H, y, R):
             if o == MAIN:
+                _fill(
+                    s[SYSTEMATIC : SYSTEMATIC + 36],
+                    fix[F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS + H_SYSTEMATIC :],
+                )
                 s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
                 s[ACCEPTED_COUNT] += 1.0
                 s[T_ACCEPTED] = s[T]
@@ -936,13 +946,18 @@ def _watch(s, prm, imu, meta, k):
         n += 1
     still = False
     if complete and n >= 4:
-        gyro, accel, rate = 0.0, 0.0, 0.0
+        gyro, accel, rate, pushed = 0.0, 0.0, 0.0, 0.0
         for i in range(3):
             gyro += (square[i] - mean[i] * mean[i] / n) / (n - 1)
             accel += (square[3 + i] - mean[3 + i] * mean[3 + i] / n) / (n - 1)
             r = imu[k & IMU_MASK, 1 + i] + mean[i] / n - s[BG + i]
             rate += r * r
             s[STILL_MEAN + i] = imu[k & IMU_MASK, 1 + i] + mean[i] / n
+            force = imu[k & IMU_MASK, 4 + i] + mean[3 + i] / n
+            if s[STILL_SINCE] == math.inf:
+                s[STILL_FORCE + i] = force
+            pushed += (force - s[STILL_FORCE + i]) ** 2
+            s[STILL_FORCE + i] += 0.05 * (force - s[STILL_FORCE + i])
         # The quietest window so far is the measure of rest; it is forgotten within minutes.
         s[REST_GYRO] = min(s[REST_GYRO] * 1.001, gyro) if s[REST_GYRO] > 0.0 else gyro
         s[REST_ACCEL] = min(s[REST_ACCEL] * 1.001, accel) if s[REST_ACCEL] > 0.0 else accel
@@ -963,6 +978,8 @@ def _watch(s, prm, imu, meta, k):
         sigma2 += STILL_SPEED_SIGMA * STILL_SPEED_SIGMA
         still = (
             quiet
+            # a smooth departure: zero velocity would make a tilt of it
+            and math.sqrt(pushed) < STILL_PUSH + 4.0 * math.sqrt(accel / n)
             and t > s[STILL_BARRED]
             and math.sqrt(rate) < prm[STILL_RATE] + unsure
             and speed2 < prm[STILL_SPEED] ** 2
@@ -1214,6 +1231,9 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                 ay = s[U + 4] + 0.5 * part * (s[NEXT_U + 4] - s[U + 4])
                 az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
                 rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
+                # An accelerometer that shakes three times as much as its noise says has more of it.
+                shaken = math.sqrt(s[CHANGE_ACCEL] / 6.0 * min(s[NEXT_T] - s[T_IMU], prm[IMU_GAP]))
+                force_noise = max(force_noise, shaken - 2.0 * prm[ACCEL_NOISE])
                 if s[BLIND] > 0.0:
                     # anything up to several times what it has ever said
                     rate_noise, force_noise = s[LARGEST_GYRO] * BLIND_TIME, s[LARGEST_ACCEL] * BLIND_TIME
@@ -1492,7 +1512,8 @@ def _write_pose(s, out):
                 for n in range(3):
                     total += B[i % 3, m] * s[COV + N * (a + m) + b + n] * B[j % 3, n]
             if i < 6:
-                out[P_COV + 6 * i + j] = total
+                # No number of fixes averages away what all have in common.
+                out[P_COV + 6 * i + j] = total + s[SYSTEMATIC + 6 * i + j]
             else:
                 out[P_VCOV + 3 * (i - 6) + j - 6] = total
     out[P_T_ACCEPTED] = s[T_ACCEPTED]

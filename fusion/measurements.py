@@ -80,6 +80,8 @@ class PoseHypothesis:
 
     `position`: (3,) m, world. `quaternion_wxyz`: (4,) unit, world_from_body. `covariance`: (6, 6), see the module.
     `misfit`: squared reprojection error over its variance (dimensionless), by which two hypotheses are compared.
+    `systematic`: (6, 6) the part of `covariance` that repeats from fix to fix, of how the marker is mounted and where
+    the camera hangs; it does not average out, and stays in the covariance of the poses.
     A fix that knows no tilt says so with a large variance about x and y; one that knows no attitude, about all three.
     Raises MeasurementError for a shape, a NaN, a quaternion or a covariance that cannot be.
     """
@@ -88,17 +90,17 @@ class PoseHypothesis:
     quaternion_wxyz: Array
     covariance: Array
     misfit: float = 0.0
+    systematic: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def __post_init__(self) -> None:
         position = np.asarray(self.position, dtype=np.float64)
         quaternion = np.asarray(self.quaternion_wxyz, dtype=np.float64)
         covariance = np.asarray(self.covariance, dtype=np.float64)
-        if position.shape != (3,) or quaternion.shape != (4,) or covariance.shape != (6, 6):
-            raise MeasurementError(
-                f"pose of shapes {position.shape}, {quaternion.shape}, {covariance.shape}: "
-                "(3,), (4,), (6, 6) are needed"
-            )
-        if not (np.isfinite(position).all() and np.isfinite(quaternion).all() and np.isfinite(covariance).all()):
+        systematic = np.asarray(self.systematic, dtype=np.float64)
+        shapes = position.shape, quaternion.shape, covariance.shape, systematic.shape
+        if shapes != ((3,), (4,), (6, 6), (6, 6)):
+            raise MeasurementError(f"pose of shapes {shapes}: (3,), (4,), (6, 6), (6, 6) are needed")
+        if not all(np.isfinite(numbers).all() for numbers in (position, quaternion, covariance, systematic)):
             raise MeasurementError("pose with a number that is not finite")
         norm = float(np.linalg.norm(quaternion))
         # 1e-3: six printed decimals keep it, a quaternion in the wrong units or order of magnitude does not.
@@ -113,6 +115,7 @@ class PoseHypothesis:
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "quaternion_wxyz", quaternion / norm)
         object.__setattr__(self, "covariance", 0.5 * (covariance + covariance.T))
+        object.__setattr__(self, "systematic", systematic)
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,7 @@ def fix_row(fix: PoseFix) -> Array:
         row[at + k.H_QUAT : at + k.H_QUAT + 4] = hypothesis.quaternion_wxyz
         row[at + k.H_COV : at + k.H_COV + 36] = hypothesis.covariance.ravel()
         row[at + k.H_MISFIT] = hypothesis.misfit
+        row[at + k.H_SYSTEMATIC : at + k.H_SYSTEMATIC + 36] = hypothesis.systematic.ravel()
     return row
 
 
@@ -66,7 +67,7 @@ class Timeline:
         return int(k.process(self._address, k.FEED_SAMPLES, CHANNELS[channel], 0.0, samples, outputs))
 
     def feed_wheels(self, samples: Array) -> int:
-        """Readings of the wheels (n, 3): t, forward speed, yaw rate. -> how many were neither duplicates nor too late."""
+        """Readings of the wheels (n, 3): t, forward speed, yaw rate. -> how many were neither repeated nor too late."""
         return int(k.process(self._address, k.FEED_WHEELS, k.BEST, 0.0, samples, self._nothing))
 
     def feed_fix(self, row: Array) -> int:

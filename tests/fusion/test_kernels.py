@@ -11,7 +11,7 @@ from fusion.params import FilterParams
 from fusion.timeline import parameter_vector
 
 INPUT = np.array([0.7, -0.4, 1.1, 0.8, -1.2, 9.4])
-ERROR = [(k.TH, 3), (k.DV, 3), (k.DP, 3), (k.DBG, 3), (k.DBA, 3), (k.DTD, 1), (k.DTILT, 2)]
+ERROR = [(k.TH, 3), (k.DV, 3), (k.DP, 3), (k.DBG, 3), (k.DBA, 3), (k.DTD, 1), (k.DTILT, 2), (k.DWHEEL, 2)]
 
 
 def some_state(rng):
@@ -39,19 +39,19 @@ def moved(s, dx):
     out[k.Q : k.Q + 4] = quaternion_from_rotation(R @ exp_so3(dx[k.TH : k.TH + 3]))
     out[k.V : k.V + 3] += R @ dx[k.DV : k.DV + 3]
     out[k.POS : k.POS + 3] += R @ dx[k.DP : k.DP + 3]
-    out[k.BG : k.BG + 9] += dx[k.DBG :]
+    out[k.BG : k.COV] += dx[k.DBG :]
     return out
 
 
 def error(s, other):
-    """The error (18,) that leads from s to other."""
+    """The error (N,) that leads from s to other."""
     R = rotation_from_quaternion(s[k.Q : k.Q + 4])
     return np.concatenate(
         [
             log_so3(R.T @ rotation_from_quaternion(other[k.Q : k.Q + 4])),
             R.T @ (other[k.V : k.V + 3] - s[k.V : k.V + 3]),
             R.T @ (other[k.POS : k.POS + 3] - s[k.POS : k.POS + 3]),
-            other[k.BG : k.BG + 9] - s[k.BG : k.BG + 9],
+            other[k.BG : k.COV] - s[k.BG : k.COV],
         ]
     )
 
