@@ -86,7 +86,7 @@ def test_of_many_markers_at_rest_each_has_its_turn():
     assert [len(tracker.track(image, k / RATE_HZ)) for k in range(2)] == [6, 6]  # search, and sweep for repeated ones
     seen = [{s.id for s in tracker.track(image, k / RATE_HZ)} for k in range(2, 8)]
     assert [len(ids) for ids in seen] == [STILL_AT_ONCE] * 6
-    assert all(3 <= sum(id in ids for ids in seen) <= 5 for id in range(6))
+    assert all(sum(id in ids for ids in seen) >= 3 for id in range(6))
 
 
 @pytest.mark.parametrize("case", ["dark", "small", "blurred"])
