@@ -718,7 +718,7 @@ class Service:
             raise RefusedError(f'the IMU of "{hello.robot}" is on {robot.config.imu.source}, by the configuration')
         link = self._take(robot, visitor)
         rate_hz = min(hello.pose_rate_hz, self.config.server.pose_rate_hz)
-        await visitor.tell(Welcome(hello.robot, SERVICE, rate_hz))
+        visitor.tell_now(Welcome(hello.robot, SERVICE, rate_hz))
         log.info("robot %s has connected", hello.robot)
         topics = [f"own/{hello.robot}"] if rate_hz > 0.0 else []
         clock = asyncio.create_task(self._ask_clock(link))
@@ -795,7 +795,7 @@ class Service:
         if subscription.topics and self.ready.is_set() and subscription.is_due(now, early=True):
             pose = self._pose(robot, now)
             if pose is not None:
-                self.hub.answer(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
+                self.hub.send(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
 
     async def _ask_clock(self, link: _Link) -> None:
         visitor, questions = link.visitor, link.questions

@@ -229,7 +229,7 @@ def test_an_early_answer_does_not_change_the_rate() -> None:
         now = 100.0 + i * 1e-3
         if i % 50 == 17:
             assert client.subscription.is_due(now, early=True)
-            hub.answer(now, client.subscription, b"early")
+            hub.send(now, client.subscription, b"early")
             assert client.received[-1] == b"early"
             answered += 1
         if i % 10 == 0:
@@ -244,7 +244,7 @@ def test_more_batches_than_poses_are_not_all_answered() -> None:
     for i in range(2000):
         now = 100.0 + i * 0.005
         if client.subscription.is_due(now, early=True):
-            hub.answer(now, client.subscription, b"early")
+            hub.send(now, client.subscription, b"early")
     assert len(client.received) == pytest.approx(200, abs=2)
 
 
