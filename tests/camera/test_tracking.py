@@ -1,11 +1,16 @@
+import json
+
+import cv2
 import numpy as np
 import pytest
 
+from camera.capture import read_image
 from camera.synthetic import Room
 from camera.tracking import SEARCH_EVERY, STILL_AT_ONCE, MarkerTracker, Prediction
 from fusion.geometry import rotation_about_z, transform
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA
 from tests.camera.test_markers import HARD, errors, frame
+from tests.data import data
 
 RATE_HZ = 30.0
 ROOM = Room(INTRINSICS, WORLD_FROM_CAMERA, "4X4_50", 3)
@@ -87,6 +92,24 @@ def test_of_many_markers_at_rest_each_has_its_turn():
     seen = [{s.id for s in tracker.track(image, k / RATE_HZ)} for k in range(2, 8)]
     assert [len(ids) for ids in seen] == [STILL_AT_ONCE] * 6
     assert all(sum(id in ids for ids in seen) >= 3 for id in range(6))
+
+
+def test_photographs_are_followed_where_they_move():
+    folder = data("aruco_photos")
+    for name, expected in json.loads((folder / "truth.json").read_text()).items():
+        if "markers" not in expected:
+            continue
+        image = read_image(folder / name)
+        tracker = MarkerTracker(expected["dictionary"], [int(id) for id in expected["markers"]])
+        for k in range(4):
+            shift = np.array([5.3, -3.7]) * k
+            moved = cv2.warpAffine(image, np.column_stack([np.eye(2), shift]), image.shape[1::-1])
+            sightings = tracker.track(moved, k / RATE_HZ)
+            assert len(sightings) == len(expected["markers"])
+            for sighting in sightings:
+                known = slice(2) if str(sighting.id) in expected.get("only_first_two_corners_of", []) else slice(4)
+                error = sighting.corners_px - shift - expected["markers"][str(sighting.id)]
+                assert np.linalg.norm(error[known], axis=1).max() < 0.5, (name, sighting.id, k)
 
 
 @pytest.mark.parametrize("case", ["dark", "small", "blurred"])
