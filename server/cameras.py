@@ -56,7 +56,7 @@ class Seen:
 class SightedFrame:
     """A frame that was looked at elsewhere: its stamp (s, host monotonic), its size and what was seen in it.
 
-    `detect_ms`: how long that took.
+    `detect_ms`: how long that took. `repeated`: ids that were seen at several places, and left out.
     """
 
     t: float
@@ -65,6 +65,7 @@ class SightedFrame:
     height_px: int
     sightings: list[MarkerSighting]
     detect_ms: float
+    repeated: frozenset[int]
 
 
 class Source(Protocol):
@@ -238,6 +239,7 @@ class Camera:
         arrival = time.monotonic()
         if isinstance(frame, SightedFrame):
             self._take_size(frame.width_px, frame.height_px)
+            self._take_repeated(frame.repeated)
             sightings, self.detect_ms = frame.sightings, frame.detect_ms
         else:
             self._take_size(frame.image.shape[1], frame.image.shape[0])
@@ -271,11 +273,14 @@ class Camera:
             poses = self._poses_at(t)
             predictions = predict(self._bodies, poses, self.intrinsics, placement.world_from_camera, frame.line_time)
         sightings = self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
-        if (repeated := self._tracking.repeated) != self.repeated:
+        self._take_repeated(self._tracking.repeated)
+        return sightings
+
+    def _take_repeated(self, repeated: frozenset[int]) -> None:
+        if repeated != self.repeated:
             self.repeated = repeated
             for text in self._repetitions().values():
                 log.warning("camera %s: %s", self.config.name, text)
-        return sightings
 
     def _repetitions(self) -> dict[str, str]:
         return {
