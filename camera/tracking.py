@@ -129,7 +129,8 @@ class MarkerTracker:
         resting = frozenset(sorted(in_view, key=lambda id: self._tracks[id].t)[STILL_AT_ONCE:])
         expected = self._expected(t, predictions or {}, resting)
         found = self._follow(picture, t, expected)
-        missed = {id: where for id, where in expected.items() if id not in found}
+        # Where a prediction did not help, it may be wrong, and the robot where it was.
+        missed = {id: self._continued(id, t) or where for id, where in expected.items() if id not in found}
         if missed:
             found |= self._look_nearby(picture, missed)
         self._since_search += 1
@@ -159,25 +160,31 @@ class MarkerTracker:
     ) -> dict[int, Prediction]:
         """Where to look: as predicted, unless what the last frames tell is better."""
         expected = {id: where for id, where in predictions.items() if id in self.ids}
-        for id, track in self._tracks.items():
-            dt = t - track.t
+        for id in self._tracks:
             if id in expected and expected[id].sigma_px <= NEAR_PX:
                 continue
-            if id in self._still:
-                own = Prediction(track.corners_px, _SIGMA_PX, track.sigma_px)
-            elif 0.0 <= dt <= REMEMBERED:
-                side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
-                sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
-                own = Prediction(track.corners_px + track.velocity_px * dt, sigma, track.sigma_px)
-            else:
-                continue
-            if id not in expected or own.sigma_px < expected[id].sigma_px:
+            own = self._continued(id, t)
+            if own is not None and (id not in expected or own.sigma_px < expected[id].sigma_px):
                 expected[id] = own
         return {
             id: where
             for id, where in expected.items()
             if id not in self.repeated and id not in resting and self._missed.get(id, 0) <= _GIVEN_UP
         }
+
+    def _continued(self, id: int, t: float) -> Prediction | None:
+        """Where a marker is that was seen lately, if it goes on as it did."""
+        track = self._tracks.get(id)
+        if track is None:
+            return None
+        if id in self._still:
+            return Prediction(track.corners_px, _SIGMA_PX, track.sigma_px)
+        dt = t - track.t
+        if not 0.0 <= dt <= REMEMBERED:
+            return None
+        side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
+        sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
+        return Prediction(track.corners_px + track.velocity_px * dt, sigma, track.sigma_px)
 
     def _follow(self, picture: Image, t: float, expected: Mapping[int, Prediction]) -> dict[int, Found]:
         """Those whose place and identity are known well enough for a look at their edges."""
@@ -226,7 +233,8 @@ class MarkerTracker:
         cheap = (_LONG, _SHORT) if shortest >= _LONG_PX else (_SHORT,) if shortest >= _SHORT_PX else (_TINY,)
         hard = _HARD if self.sides_px is not None and shortest >= _SHORT_PX else _HARD_AND_TINY
         last = hard[self._hard % len(hard)]
-        bounds = (SMALLEST_SIDE_PX, math.inf) if self.sides_px is None else _about(shortest, longest)
+        anything = SMALLEST_SIDE_PX, math.inf
+        expected = anything if self.sides_px is None else _about(shortest, longest)
         seen = list(found.values())
         if self.repeated or not missing:
             # The best of them: the others may see one of two.
@@ -235,7 +243,7 @@ class MarkerTracker:
             if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
             before = len(seen)
-            seen = distinct(seen + self._detector.look(picture, way, bounds))
+            seen = distinct(seen + self._detector.look(picture, way, expected if way in cheap else anything))
             if set(missing) <= {marker.id for marker in seen}:
                 break
         else:

@@ -162,8 +162,9 @@ class Camera:
         self._next_look = -math.inf
         self._settled = self.placement is not None
         self._moved = False
-        # The placement that the tracking knows the size of markers for.
+        # The placement that the tracking knows the size of markers for, and the camera's pose as in the last frame.
         self._sides_of: Placement | None = None
+        self._world_from_camera = np.eye(4)
         # The anchors' corners while the camera hangs as it was found to, px, by id.
         self._at_rest: dict[int, Array] = {}
         self._arrivals: deque[float] = deque()
@@ -270,8 +271,9 @@ class Camera:
         if (placement := self.placement) is not None:
             if placement is not self._sides_of:
                 self._sides_of, self._tracking.sides_px = placement, self._sides_px(placement)
+                self._world_from_camera = placement.world_from_camera
             poses = self._poses_at(t)
-            predictions = predict(self._bodies, poses, self.intrinsics, placement.world_from_camera, frame.line_time)
+            predictions = predict(self._bodies, poses, self.intrinsics, self._world_from_camera, frame.line_time)
         sightings = self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
         self._take_repeated(self._tracking.repeated)
         return sightings
@@ -358,6 +360,7 @@ class Camera:
         world_from_camera, covariance = placement.world_from_camera, placement.covariance
         if (shake := measure_shake(self._at_rest, sightings, self.intrinsics)) is not None:
             world_from_camera, covariance = shaken(world_from_camera, covariance, shake)
+        self._world_from_camera = world_from_camera
         return solve(
             self._bodies,
             sightings,

@@ -124,3 +124,13 @@ def test_hard_frames_are_searched_as_by_a_detector_and_then_followed(case):
     assert [sighting.id for sighting in sightings] == list(range(6))
     over_sigma = errors(sightings, truth) / np.array([sighting.sigma_px for sighting in sightings])[:, None, None]
     assert np.sqrt(np.mean(over_sigma**2)) < 1.5
+
+
+def test_a_filter_that_is_wrong_does_not_lose_what_is_in_view():
+    tracker = MarkerTracker("4X4_50", ids=[7, 8])
+    for k in range(1, 20):
+        image, truth = seen(drive(k))
+        elsewhere = Prediction(truth + 60.0, 0.5)
+        sightings = tracker.track(image, k / RATE_HZ, predictions={7: elsewhere} if k > 1 else {})
+        assert [sighting.id for sighting in sightings] == [7], k
+        assert np.abs(sightings[0].corners_px - truth).max() < 0.25
