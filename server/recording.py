@@ -5,8 +5,8 @@
                 the body's origin along its axes, as `imu.mounting` says; without it imu.csv holds those
     fixes.csv   t_s,arrival_s,x,y,z,qw,qx,qy,qz  world_from_body at t_s; optional sigma_position,sigma_attitude
                 (m, rad), or what a camera knows more: misfit, source, markers (ids, with spaces between), cov_00 ...
-                cov_55 (upper triangle of the covariance as in `fusion.measurements`), and a second hypothesis with
-                the same columns headed alt_
+                cov_55 (upper triangle of the covariance as in `fusion.measurements`), sys_00 ... sys_55 (of its
+                systematic part), and a second hypothesis with the same columns headed alt_
     truth.csv   t_s,x,y,z,qw,qx,qy,qz            optional, never an input
     poses.tum   t x y z qx qy qz qw              what was published live, one line an IMU sample (TUM format)
 
@@ -36,7 +36,8 @@ POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 TRUTH_COLUMNS = ("t_s", *POSE_COLUMNS)
 UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 COVARIANCE_COLUMNS = tuple(f"cov_{i}{j}" for i, j in UPPER)
-HYPOTHESIS_COLUMNS = (*POSE_COLUMNS, "misfit", *COVARIANCE_COLUMNS)
+SYSTEMATIC_COLUMNS = tuple(f"sys_{i}{j}" for i, j in UPPER)
+HYPOTHESIS_COLUMNS = (*POSE_COLUMNS, "misfit", *COVARIANCE_COLUMNS, *SYSTEMATIC_COLUMNS)
 FIX_COLUMNS = (
     "t_s",
     "arrival_s",
@@ -229,17 +230,18 @@ def _load_fixes(path: Path, params: FilterParams) -> list[PoseFix]:
 
 
 def _hypothesis(cells: dict[str, str], number: Any, head: str, params: FilterParams) -> PoseHypothesis:
-    covariance = np.zeros((6, 6))
-    if f"{head}cov_00" in cells:
-        for (i, j), name in zip(UPPER, COVARIANCE_COLUMNS, strict=True):
-            covariance[i, j] = covariance[j, i] = number(head + name)
-    else:
+    covariance, systematic = np.zeros((6, 6)), np.zeros((6, 6))
+    for matrix, names in ((covariance, COVARIANCE_COLUMNS), (systematic, SYSTEMATIC_COLUMNS)):
+        if head + names[0] in cells:
+            for (i, j), name in zip(UPPER, names, strict=True):
+                matrix[i, j] = matrix[j, i] = number(head + name)
+    if f"{head}cov_00" not in cells:
         position = number("sigma_position", 0.0) if "sigma_position" in cells else params.fix_position_sigma
         attitude = number("sigma_attitude", 0.0) if "sigma_attitude" in cells else params.fix_attitude_sigma
         np.fill_diagonal(covariance, [position**2] * 3 + [attitude**2] * 3)
     pose = [number(head + name) for name in POSE_COLUMNS]
     misfit = number(f"{head}misfit") if f"{head}misfit" in cells else 0.0
-    return PoseHypothesis(np.array(pose[:3]), np.array(pose[3:]), covariance, misfit)
+    return PoseHypothesis(np.array(pose[:3]), np.array(pose[3:]), covariance, misfit, systematic)
 
 
 def write_tum(path: Path, track: Array) -> None:
@@ -291,7 +293,7 @@ class Recorder:
             if i == 1:
                 cells += origin
             cells += [*hypothesis.position, *hypothesis.quaternion_wxyz, hypothesis.misfit]
-            cells += [hypothesis.covariance[at] for at in UPPER]
+            cells += [matrix[at] for matrix in (hypothesis.covariance, hypothesis.systematic) for at in UPPER]
         if len(fix.hypotheses) == 1:
             cells += [*origin, *([""] * len(HYPOTHESIS_COLUMNS))]
         self._write(fix.robot, "fixes.csv", cells)
