@@ -262,8 +262,6 @@ def test_a_camera_with_a_token_is_taken_with_it_alone(room: Config) -> None:
 def test_a_second_node_of_one_name_has_to_wait_until_the_first_is_silent(
     room: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("server.remote_cameras.SILENCE", 0.3)
-
     async def main() -> None:
         async with serving(room) as service:
             camera = service.cameras["ceiling"]
@@ -273,6 +271,7 @@ def test_a_second_node_of_one_name_has_to_wait_until_the_first_is_silent(
                     refused = await camera_hello(second)
                     assert (refused["type"], refused["retry"]) == ("error", True)
                     assert 'camera "ceiling" is already connected, from 127.0.0.1' in refused["reason"]
+                monkeypatch.setattr("server.remote_cameras.SILENCE", 0.3)
                 await until(lambda: "says nothing any more" in camera.status)
                 async with client(service, "/v1/camera") as third:
                     assert (await camera_hello(third))["type"] == "welcome"
