@@ -41,7 +41,7 @@ _SIGMA_PX, _SWERVE = 1.0, 20.0
 _GIVEN_UP = 5
 # Frames, and s, between two searches of the whole picture while a marker is missing.
 SEARCH_EVERY, SEARCH_INTERVAL = 10, 0.5
-# s between two while none is missing, lest one is there twice.
+# s between two while none is missing, lest one is there twice, or where nobody thinks that it is.
 SWEEP_INTERVAL = 5.0
 
 # Of markers that are still, so many are looked at in a frame: enough to tell a shaken camera from a marker that moved.
@@ -120,21 +120,28 @@ class MarkerTracker:
     ) -> list[MarkerSighting]:
         """The markers of the next frame, by id. `image` as in `grey`; `t`: s, mid-exposure of its first row.
 
-        `predictions` by id, from whoever knows more than the last frames tell. `line_time`: s from one row's exposure
+        `predictions` by id, from whoever knows more than the last frames tell; what is predicted out of the picture is
+        not missed there. `line_time`: s from one row's exposure
         to the next one's; each sighting is stamped by the row of its middle.
         """
         picture = grey(image)
         # Those that were looked at longest ago have their turn.
         in_view = [id for id in self._still & self._tracks.keys() if self._missed[id] <= _GIVEN_UP]
         resting = frozenset(sorted(in_view, key=lambda id: self._tracks[id].t)[STILL_AT_ONCE:])
-        expected = self._expected(t, predictions or {}, resting)
+        predictions = predictions or {}
+        elsewhere = {
+            id
+            for id, where in predictions.items()
+            if _box(where.corners_px, 3.0 * where.sigma_px, picture.shape) is None
+        }
+        expected = self._expected(t, predictions, resting)
         found = self._follow(picture, t, expected)
         # Where a prediction did not help, it may be wrong, and the robot where it was.
         missed = {id: self._continued(id, t) or where for id, where in expected.items() if id not in found}
         if missed:
             found |= self._look_nearby(picture, missed)
         self._since_search += 1
-        if missing := self.ids - found.keys() - resting:
+        if missing := self.ids - found.keys() - resting - elsewhere:
             due = self._since_search >= SEARCH_EVERY or not 0.0 <= t - self._searched < SEARCH_INTERVAL
             if due or any(self._missed.get(id) == 0 for id in missing):
                 found = self._search(picture, found, missing)

@@ -17,12 +17,12 @@ import numpy as np
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import Delivery, DeliveryMeter, EdgeBlur, advice, black, blur_px
-from camera.fix import Body, MarkerMount, marker_poses, predict, rays, solve
+from camera.fix import Body, MarkerMount, marker_corners, marker_poses, predict, project, rays, solve
 from camera.floor import Anchor, Placement, PlacementError, averaged, load_placement, locate_camera
 from camera.markers import MarkerSighting
 from camera.shake import measure_shake, shaken
-from camera.tracking import MarkerTracker
-from fusion.geometry import exp_so3, log_so3, rotation_about_z, transform
+from camera.tracking import MarkerTracker, Prediction
+from fusion.geometry import exp_so3, inverse, log_so3, rotation_about_z, transform, transform_points
 from fusion.measurements import Array, Pose, PoseFix
 from server.config import AnchorConfig, CameraConfig, Config, ConfigError, MarkerConfig
 from server.messages import tracker_message
@@ -165,6 +165,8 @@ class Camera:
         # The placement that the tracking knows the size of markers for, and the camera's pose as in the last frame.
         self._sides_of: Placement | None = None
         self._world_from_camera = np.eye(4)
+        # Anchors that this camera cannot see from there.
+        self._anchors_elsewhere: dict[int, Prediction] = {}
         # The anchors' corners while the camera hangs as it was found to, px, by id.
         self._at_rest: dict[int, Array] = {}
         self._arrivals: deque[float] = deque()
@@ -272,8 +274,10 @@ class Camera:
             if placement is not self._sides_of:
                 self._sides_of, self._tracking.sides_px = placement, self._sides_px(placement)
                 self._world_from_camera = placement.world_from_camera
+                self._anchors_elsewhere = self._out_of_view(placement)
             poses = self._poses_at(t)
             predictions = predict(self._bodies, poses, self.intrinsics, self._world_from_camera, frame.line_time)
+            predictions |= self._anchors_elsewhere
         sightings = self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
         self._take_repeated(self._tracking.repeated)
         return sightings
@@ -289,6 +293,19 @@ class Camera:
             f"marker {id}": f"marker {id} is in view more than once; which one is meant cannot be told, so none is used"
             for id in sorted(self.repeated)
         }
+
+    def _out_of_view(self, placement: Placement) -> dict[int, Prediction]:
+        """Where the anchors should be seen that are far from the picture or behind the camera."""
+        size, far = np.array(self._image_size), {}
+        for anchor in self._anchors:
+            points = transform_points(
+                inverse(placement.world_from_camera) @ anchor.world_from_marker, marker_corners(anchor.size)
+            )
+            behind = points[:, 2].min() < 1e-3
+            corners = np.full((4, 2), -1e6) if behind else project(points, self.intrinsics)[0]
+            if (corners.max(axis=0) < -0.1 * size).any() or (corners.min(axis=0) > 1.1 * size).any():
+                far[anchor.id] = Prediction(corners, 1.0)
+        return far
 
     def _sides_px(self, placement: Placement) -> tuple[float, float]:
         """How long the sides of the smallest and the largest marker appear, anywhere in the picture."""

@@ -134,3 +134,12 @@ def test_a_filter_that_is_wrong_does_not_lose_what_is_in_view():
         sightings = tracker.track(image, k / RATE_HZ, predictions={7: elsewhere} if k > 1 else {})
         assert [sighting.id for sighting in sightings] == [7], k
         assert np.abs(sightings[0].corners_px - truth).max() < 0.25
+
+
+def test_what_is_predicted_out_of_the_picture_is_not_searched():
+    image, truth = seen(drive(0))
+    for shift, found in (([-2000.0, 0.0], 0), ([0.0, 1e6], 0), ([20.0, 0.0], 1)):
+        tracker = MarkerTracker("4X4_50", ids=[7])
+        prediction = {7: Prediction(truth + shift, 2.0)}
+        assert tracker.track(EMPTY, 0.0, predictions=prediction) == []
+        assert len(tracker.track(image, 1.0, predictions=prediction)) == found
