@@ -53,6 +53,7 @@ from server.messages import (
     MessageError,
     Notice,
     Welcome,
+    Wheels,
     decode_hello,
     decode_watch,
 )
@@ -784,6 +785,10 @@ class Service:
                 robot.feed_imu(readings, arrival, arrival)
                 if robot.clock.restarts > restarts:
                     self._note(robot.config.name, f"its clock has jumped or started anew; it reads {readings[-1][0]} s")
+            case Wheels() as message:
+                wheels = dialect.wheels(message)
+                if self.ready.is_set():
+                    robot.feed_wheels(wheels, arrival)
             case ClockAnswer(id, received, sent):
                 link.questions.take(id, dialect.seconds(received), dialect.seconds(sent), arrival, robot.clock)
             case Hello():
