@@ -307,7 +307,7 @@ def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
     moving = np.concatenate([[0], np.cumsum(~still)])
     groups: dict[tuple[str, tuple[int, ...]], list[JudgedFix]] = {}
     for fix in seen.fixes:
-        if not _is_turned(fix):
+        if not is_turned(fix):
             groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
     for (source, markers), own in groups.items():
         t = np.array([fix.outcome.t for fix in own]) + seen.localiser.time_offset
@@ -531,9 +531,10 @@ def _of_gyro(turns: Turns | None) -> Iterator[Diagnosis]:
             return
 
 
-def _is_turned(fix: JudgedFix) -> bool:
+def is_turned(fix: JudgedFix) -> bool:
+    """Its attitude is far off and was not believed; its position may have been."""
     outcome = fix.outcome
-    return outcome.outcome not in BELIEVED and float(np.linalg.norm(outcome.innovation[3:])) > TURNED_LEAST
+    return outcome.outcome is not Outcome.ACCEPTED and float(np.linalg.norm(outcome.innovation[3:])) > TURNED_LEAST
 
 
 def _of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
@@ -543,7 +544,7 @@ def _of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
         groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
     turned: list[tuple[str, dict[str, Any]]] = []
     for (source, markers), own in groups.items():
-        turn = np.array([fix.outcome.innovation[3:] for fix in own if _is_turned(fix)]).reshape(-1, 3)
+        turn = np.array([fix.outcome.innovation[3:] for fix in own if is_turned(fix)]).reshape(-1, 3)
         if not len(turn):
             continue
         angle = np.linalg.norm(turn, axis=1)
@@ -607,7 +608,7 @@ class Innovations(NamedTuple):
 
 def _innovations(seen: Seen) -> Innovations | None:
     """None where there are too few."""
-    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2) and not _is_turned(fix)]
+    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2) and not is_turned(fix)]
     markers, marker = _most([fix.markers for fix in fixes])
     cameras, camera = _most([fix.outcome.source for fix in fixes])
     # What the filter had of fixes before the first ones is not known.
@@ -644,29 +645,31 @@ def _of_places(seen: Seen, axes: int) -> tuple[list[Diagnosis], bool]:
     moved = np.einsum("nij,nj->ni", world_from_body, of.value[:, :3])[:, :axes]
     offset, covariance, share = _explanation(response, moved, total, of.used)
 
-    parts = []
-    for i in range(len(on_robot) + len(in_world)):
-        at = slice(axes * i, axes * (i + 1))
-        sigmas = math.sqrt(float(offset[at] @ np.linalg.solve(covariance[at, at], offset[at])))
-        parts.append((offset[at], float(np.linalg.norm(offset[at])), sigmas))
+    unit = np.eye(len(on_robot) + len(in_world))
+    parts = [_combined(signs, offset, covariance) for signs in unit]
+
     said: list[Diagnosis] = []
     off, likely = [], False
-    for markers, (by, size, sigmas) in zip(of.markers, parts, strict=False):
+    for i, (by, size, sigmas) in enumerate(parts[: len(of.markers)]):
         likely |= share >= PLACE_LIKELY and size >= PLACE_LEAST and sigmas >= SIGMAS
         if share >= PLACE_SHARE and size >= PLACE_LEAST and sigmas >= PLACE_SIGMAS:
-            off.append((markers, by, size, sigmas))
-    for markers, by, size, sigmas in off:
-        axis = int(np.argmax(np.abs(by)))
-        way = (("back", "right", "down"), ("front", "left", "up"))[int(by[axis] > 0.0)][axis]
-        several = len(of.markers) > 1
-        text = (
-            f"{_named(markers) if several else 'the marker'} sits {1e3 * size:.0f} mm or more farther to the {way} of "
-        )
-        text += "the robot than is entered"
-        text += ", or the IMU as much to the other side" if len(off) == len(of.markers) else ""
-        evidence: dict[str, Any] = {"markers": list(markers)} if several else {}
-        evidence |= {"mm": (1e3 * by).tolist(), "sigmas": sigmas, "explained": share}
-        said.append(Diagnosis("marker_place", "warning", text, evidence))
+            off.append(i)
+            axis = int(np.argmax(np.abs(by)))
+            way = (("back", "right", "down"), ("front", "left", "up"))[int(by[axis] > 0.0)][axis]
+            name = _named(of.markers[i]) if len(of.markers) > 1 else "the marker"
+            text = f"{name} sits {1e3 * size:.0f} mm or more farther to the {way} of the robot than is entered"
+            text += ", or the IMU as much to the other side" if len(of.markers) == 1 else ""
+            evidence: dict[str, Any] = {"markers": list(of.markers[i])} if len(of.markers) > 1 else {}
+            evidence |= {"mm": (1e3 * by).tolist(), "sigmas": sigmas, "explained": share}
+            said.append(Diagnosis("marker_place", "warning", text, evidence))
+    for i in range(1, len(of.markers)):
+        by, size, sigmas = _combined(unit[i] - unit[0], offset, covariance)
+        # Markers can be compared more sharply with each other than each with the IMU.
+        if not {0, i} & set(off) and share >= PLACE_SHARE and size >= PLACE_LEAST and sigmas >= PLACE_SIGMAS:
+            text = f"{_named(of.markers[0])} and {_named(of.markers[i])} disagree by {1e3 * size:.0f} mm: "
+            text += "one of them sits elsewhere on the robot than is entered"
+            evidence = {"markers": [*of.markers[0], *of.markers[i]], "mm": (1e3 * by).tolist(), "sigmas": sigmas}
+            said.append(Diagnosis("marker_place", "warning", text, evidence | {"explained": share}))
     for camera, (by, size, sigmas) in zip(of.cameras[1:], parts[len(of.markers) :], strict=True):
         if size >= CAMERA_LEAST and sigmas >= PLACE_SIGMAS:
             text = f"fixes of camera {camera} disagree with those of camera {of.cameras[0]} by {1e3 * size:.0f} mm"
@@ -675,6 +678,13 @@ def _of_places(seen: Seen, axes: int) -> tuple[list[Diagnosis], bool]:
     if len(of.markers) > 1:
         said += _of_headings(of)
     return said, likely or bool(said)
+
+
+def _combined(signs: Array, offset: Array, covariance: Array) -> tuple[Array, float, float]:
+    """A sum of the constants that stand together in `offset`, its length, and that in sigmas."""
+    pick = np.kron(signs, np.eye(len(offset) // len(signs)))
+    by = pick @ offset
+    return by, float(np.linalg.norm(by)), math.sqrt(float(by @ np.linalg.solve(pick @ covariance @ pick.T, by)))
 
 
 def _of_headings(of: Innovations) -> Iterator[Diagnosis]:

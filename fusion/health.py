@@ -33,6 +33,7 @@ from fusion.diagnosis import (
     Score,
     Seen,
     diagnose,
+    is_turned,
 )
 from fusion.localiser import Localiser
 from fusion.measurements import Array, FixOutcome, Outcome, Pose, PoseFix, PoseHypothesis
@@ -161,7 +162,7 @@ class Health:
     def _score(self, fix: JudgedFix) -> None:
         self._fixes.append(fix)
         outcome = fix.outcome.outcome
-        if outcome is Outcome.REJECTED:
+        if outcome is Outcome.REJECTED or (outcome is Outcome.INFLATED and is_turned(fix)):
             self._doubtful.append(fix)
             return
         before = list(self._doubtful) if outcome is Outcome.REINITIALISED else []

