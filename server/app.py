@@ -329,7 +329,8 @@ class Service:
 
         def look() -> None:
             robots = self.robots if self.ready.is_set() else {}
-            poses = {name: robot.localiser.pose_at(t) for name, robot in robots.items()}
+            # What the filters find the camera's stamps to be off by is theirs alone.
+            poses = {name: r.localiser.pose_at(t + r.localiser.time_offset) for name, r in robots.items()}
             answer.set_result({name: pose for name, pose in poses.items() if pose is not None})
 
         self._call_from_thread(look)
