@@ -250,7 +250,8 @@ class MarkerTracker:
             if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
             before = len(seen)
-            seen = distinct(seen + self._detector.look(picture, way, expected if way in cheap else anything))
+            # The thorough look is at everything, lest a size in the configuration is wrong.
+            seen = distinct(seen + self._detector.look(picture, way, anything if way == _THOROUGH else expected))
             if set(missing) <= {marker.id for marker in seen}:
                 break
         else:
