@@ -106,6 +106,7 @@ class Robot:
         if self._recording is not None:
             self._recording.wheels(odometry)
         self.vitals.judged(self.localiser.feed(odometry))
+        self.vitals.wheels(odometry)
 
     def feed_fix(self, fix: PoseFix, now: float) -> None:
         """A fix, which counts as arrived now."""
@@ -145,8 +146,9 @@ class Robot:
         """Bring `diagnoses` up to date. -> what is new, for the log: each once when it comes and when it goes."""
         self.diagnoses = self.vitals.diagnoses(now)
         said = {diagnosis.code for diagnosis in self.diagnoses}
-        # What needs no fixes to be seen.
-        for diagnosis in (Diagnosis(*finding) for finding in self.stream.findings() if finding.code not in said):
+        # What needs no fixes to be seen, of an IMU that is not long gone.
+        findings = self.stream.findings() if now - self.heard < GONE_AFTER else []
+        for diagnosis in (Diagnosis(*finding) for finding in findings if finding.code not in said):
             since, *_ = self.vitals.said.get(diagnosis.key, (now,))
             self.vitals.said[diagnosis.key] = since, now, diagnosis
             self.diagnoses.append(diagnosis)
