@@ -277,8 +277,8 @@ def test_the_remote_camera_is_killed_and_comes_back(monkeypatch: pytest.MonkeyPa
 
     children = CHILDREN.read_text()
     asyncio.run(test())
-    # As long as the camera was there; without it the robots drift, as they have learnt little of their IMUs yet. Stamps of
-    # the wrong clock would put them metres away, or nowhere.
+    # As long as the camera was there; without it the robots drift, as they have learnt little of their IMUs yet. Stamps
+    # of the wrong clock would put them metres away, or nowhere.
     assert max(errors.values()) < 0.1
     assert CHILDREN.read_text() == children
 
