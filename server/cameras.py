@@ -455,7 +455,9 @@ class Camera:
             "located": placement is not None,
             "location": self.unlocated or "ok",
             "position_m": None if placement is None else placement.world_from_camera[:3, 3].round(4).tolist(),
-            "view_m": None if placement is None else _view_on_floor(placement, self.intrinsics, *self._image_size),
+            "view_m": None
+            if placement is None or not self.frames
+            else _view_on_floor(placement, self.intrinsics, *self._image_size),
         }
 
 
