@@ -130,8 +130,8 @@ _FIRST_LOOK = 0.65, 0.9
 # Correlation of the picture within the cells: thin strokes can have the right means, but not this. The second where
 # the sides show no clear edge and OpenCV reads no marker.
 _PICTURE, _PICTURE_UNCLEAR = 0.84, 0.87
-# Correlation of the picture and its margin where a marker is followed into blur: between what tests/camera/test_alignment
-# holds for markers that are there and for others at their place.
+# Correlation of the picture and its margin where a marker is followed into blur: between what markers that are there
+# reach and others at their place, see tests/camera/test_alignment.py.
 _ALIGNED = 0.87
 # Sigma of edges from which on the whole picture may know more, px.
 _BLURRED_PX = 0.25
