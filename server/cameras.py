@@ -455,9 +455,7 @@ class Camera:
             "located": placement is not None,
             "location": self.unlocated or "ok",
             "position_m": None if placement is None else placement.world_from_camera[:3, 3].round(4).tolist(),
-            "view_m": None
-            if placement is None or not self.frames
-            else _view_on_floor(placement, self.intrinsics, *self._image_size),
+            "view_m": None if placement is None else _view_on_floor(placement, self.intrinsics, *self._image_size),
         }
 
 
@@ -485,7 +483,10 @@ def _moved(kept: Placement, found: Placement) -> float | None:
 
 
 def _view_on_floor(placement: Placement, intrinsics: Intrinsics, width_px: int, height_px: int) -> list[list[float]]:
-    """The outline of what the camera sees of the floor, m: the border of the image cut with z = 0."""
+    """The outline of what the camera sees of the floor, m: the border of the image cut with z = 0; [] before a picture
+    has told its size."""
+    if not width_px:
+        return []
     u, v = np.linspace(0.0, width_px - 1.0, 9), np.linspace(0.0, height_px - 1.0, 9)
     border = (
         [(x, 0.0) for x in u] + [(u[-1], y) for y in v] + [(x, v[-1]) for x in u[::-1]] + [(0.0, y) for y in v[::-1]]

@@ -16,7 +16,7 @@ from camera.floor import Placement, load_placement, save_placement
 from camera.synthetic import Room, straight_down
 from fusion.geometry import exp_so3, rotation_about_z, transform
 from server import cli
-from server.cameras import PLACEMENT_FRAMES
+from server.cameras import PLACEMENT_FRAMES, Camera
 from server.config import parse
 from tests.server.room import CONFIG, INTRINSICS, Ceiling, run, serving, until
 
@@ -250,6 +250,9 @@ def test_a_placement_is_kept_while_the_anchors_in_view_agree(tmp_path: Path) -> 
     save_placement(tmp_path / "there.toml", Placement(there, 1e-6 * np.eye(6), 0.1, (40, 41)))
 
     async def main() -> None:
+        # Before its first picture it is located, but what it sees of the floor is not known.
+        unseen = Camera(config.camera[0], config, lambda seen: None).health(0.0)
+        assert (unseen["located"], unseen["view_m"]) == (True, [])
         async with serving(config, open_camera=Ceiling) as service:
             ceiling = service.cameras["ceiling"]
             await until(lambda: ceiling.frames > 2 * PLACEMENT_FRAMES)
