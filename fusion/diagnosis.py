@@ -56,6 +56,9 @@ PLACE_LEAST, PLACE_SIGMAS, PLACE_SHARE, PLACE_FIXES, PLACE_GROUP = 0.015, 10.0, 
 PLACE_TURN, PLACE_LIKELY = math.radians(2.0), 0.05  # and the share from which the filter's states are not told
 RISE_LEAST = 0.15  # m between the 5th and the 95th percentile of the height
 WAY_PAIRS, WAY_STEP, WAY_SIGMAS = 20, 1.5, 8.0  # pairs of fixes, at most s apart
+# Of wheels: readings, what their scale may be, m and rad/s by which they are off when they slip, how often.
+WHEEL_READINGS, WHEEL_RANGE, SLIP_LEAST, SLIP_TIMES = 100, (0.7, 1.4), (0.05, 0.2), 3
+WHEEL_SCALE_LEAST = 0.01
 HEADING_LEAST, ASIDE_LEAST = 2.0, 0.15  # deg; share of the way
 LATE_SHARE, LATE_FIXES, LATE_OF_BUFFER = 0.01, 3, 0.8
 NO_FIX = 5.0  # s
@@ -65,7 +68,7 @@ BLOCK = 32  # samples
 
 BELIEVED = (Outcome.ACCEPTED, Outcome.INFLATED)
 _SENSORS = (("gyro", "gyroscope", "rad/s", slice(0, 3)), ("accel", "accelerometer", "m/s2", slice(3, 6)))
-_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates"}
+_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates", "wheel_unit"}
 _BESIDES = {"imu_missing", "imu_stamps_repeat", "no_fix", "fixes_lost", "fixes_late", "fixes_early"}
 _EIGHT = ("+x", "+x and +y", "+y", "-x and +y", "-x", "-x and -y", "-y", "+x and -y")
 
@@ -132,8 +135,9 @@ class Turns(NamedTuple):
 class Seen(NamedTuple):
     """All that a diagnosis looks at: of `WINDOW` before `now`, on the clock of the stamps.
 
-    `began`: stamp of the first sample, NaN before it. `stamps`: earliest and latest stamp of a fix ever, inf and -inf
-    before one. `fixes`: judged ones, by stamp. `lost`: how long after its stamp each arrived that came too late, s.
+    `began`: stamp of the first sample, NaN before it. `wheels` (m, 3): as in `WheelOdometry`, sorted. `stamps`:
+    earliest and latest stamp of a fix ever, inf and -inf before one. `fixes`: judged ones, by stamp. `lost`: how long
+    after its stamp each arrived that came too late, s.
     `learned`: now and then the time and the filter's noise scale.
     """
 
@@ -141,6 +145,7 @@ class Seen(NamedTuple):
     localiser: Localiser
     began: float
     chunks: Sequence[Chunk]
+    wheels: Array
     stamps: tuple[float, float]
     fixes: Sequence[JudgedFix]
     lost: Sequence[float]
@@ -158,12 +163,14 @@ def diagnose(seen: Seen) -> list[Diagnosis]:
         in_doubt = not gyro and (turns is None or _agreement(turns) < 0.8)
         found += [*_of_samples(seen, blocks, in_doubt), *_of_gravity(fixes, blocks), *gyro, *_of_rest(seen, blocks)]
     found += _of_arrivals(seen)
+    wheels = list(_of_wheels(seen, blocks)) if seen.chunks else []
+    found += [diagnosis for diagnosis in wheels if diagnosis.code in _ROOTS]
     codes = {diagnosis.code for diagnosis in found}
     for causes, besides in (({"imu_stamp_unit"}, set()), ({"fixes_clock"}, set()), (_ROOTS, _BESIDES)):
         if codes & causes:
             # Much else is wrong then, but nothing of it is the cause.
             return [diagnosis for diagnosis in found if diagnosis.code in causes | besides]
-    odd = [*_of_turns(fixes), *_of_motion(seen)]
+    odd = [*wheels, *_of_turns(fixes), *_of_motion(seen)]
     # Where the robot does not move as is assumed, innovations tell nothing else.
     places, likely = ([], False) if odd else _of_places(seen, 2 if planar else 3)
     if not odd and not places:
@@ -292,6 +299,12 @@ def _of_states(localiser: Localiser, understated: float) -> Iterator[Diagnosis]:
             text = f"the floor rises by {math.degrees(angle):.1f} deg towards {towards}; that is made up for"
             x, y = np.degrees(tilt).tolist()
             yield Diagnosis("floor_tilt", "note", text, {"x_deg": x, "y_deg": y, "chi2": chi2})
+    scales, of_scales = localiser.wheel_scale.tolist(), (understated * localiser.wheel_scale_sigma).tolist()
+    for what, scale, sigma in zip(("speed", "turning"), scales, of_scales, strict=True):
+        if sigma > 0.0 and abs(scale) >= max(WHEEL_SCALE_LEAST, SIGMAS * sigma):
+            size, way = f"{abs(scale):.1%} +- {sigma:.1%}", "much" if scale > 0.0 else "little"
+            text = f"the wheels tell {size} too {way} {what}; that is made up for"
+            yield Diagnosis(f"wheel_{what}", "note", text, {"scale": scale, "sigma": sigma})
 
 
 def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
@@ -404,6 +417,55 @@ def _of_way(markers: tuple[int, ...], fixes: Sequence[JudgedFix]) -> Iterator[Di
             f"{share:.0%} of its way is sideways in its fixes: its wheels slip or slide, or it is no differential drive"
         )
         yield Diagnosis("wheels_slide", "warning", text, evidence | {"share": share, "sigmas": sigmas, "pairs": pairs})
+
+
+def _of_wheels(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
+    """Do the wheels go as far as the fixes, and turn as the gyroscope does?"""
+    times, most = 0, 0.0
+    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2)]
+    t = np.array([fix.outcome.t for fix in fixes]) + seen.localiser.time_offset
+    speed, rate = (seen.wheels[np.isfinite(seen.wheels[:, i])][:, [0, i]] for i in (1, 2))
+    if len(speed) >= WHEEL_READINGS and len(fixes) >= WAY_PAIRS:
+        way = np.interp(t, speed[:, 0], _integral(speed))
+        heading = np.unwrap([2.0 * math.atan2(z, w) for w, _, _, z in (fix.pose.quaternion_wxyz for fix in fixes)])
+        middle, turned = 0.5 * (heading[1:] + heading[:-1]), np.diff(heading)
+        x, y = np.diff([fix.pose.position[:2] for fix in fixes], axis=0).T
+        ahead = np.cos(middle) * x + np.sin(middle) * y
+        expected = np.diff(way) * np.sinc(turned / (2.0 * math.pi))  # the chord of an arc
+        noise = np.sqrt([2.0 * fix.pose.covariance[0, 0] for fix in fixes[1:]])
+        inside = (np.diff(t) <= WAY_STEP) & (t[:-1] >= speed[0, 0]) & (t[1:] <= speed[-1, 0])
+        moving = inside & (np.abs(expected) > 10.0 * noise)
+        if np.sum(moving) >= WAY_PAIRS:
+            scale = float(np.median(ahead[moving] / expected[moving]))
+            if not WHEEL_RANGE[0] < scale < WHEEL_RANGE[1]:
+                text = f"the robot goes {scale:.3g} x as far in its fixes as by its wheels: their unit, sign or radius"
+                evidence = {"times": scale, "pairs": int(np.sum(moving))}
+                yield Diagnosis("wheel_unit", "error", text, evidence)
+                return
+            off = (ahead - scale * expected)[inside]
+            spread = np.maximum(noise[inside], 1.4826 * float(np.median(np.abs(off))))
+            slips = np.abs(off) > np.maximum(6.0 * spread, SLIP_LEAST[0])
+            times += int(np.sum(slips[1:] & ~slips[:-1]))
+    if len(rate) >= WHEEL_READINGS:
+        ends = np.interp(blocks[:, :2].T, rate[:, 0], _integral(rate))
+        inside = (blocks[:, 0] >= rate[0, 0]) & (blocks[:, 1] <= rate[-1, 0]) & (blocks[:, 1] > blocks[:, 0])
+        turns = ((ends[1] - ends[0])[inside]) / (blocks[:, 1] - blocks[:, 0])[inside]
+        gyro = blocks[inside, 4] - seen.localiser.gyro_bias[2]
+        turning = np.abs(gyro) > 0.2
+        if np.sum(turning) >= WAY_PAIRS:
+            off = turns - float(np.median(turns[turning] / gyro[turning])) * gyro
+            slips = np.abs(off) > max(8.0 * 1.4826 * float(np.median(np.abs(off))), SLIP_LEAST[1])
+            times += int(np.sum(slips[1:] & ~slips[:-1]))
+            most = float(np.max(np.abs(off)[slips], initial=0.0))
+    if times >= SLIP_TIMES:
+        text = f"the wheels slip: {times} times they went or turned otherwise than the fixes and the gyroscope"
+        yield Diagnosis("wheels_slip", "warning", text, {"times": times, "most_rad_s": most})
+
+
+def _integral(values: Array) -> Array:
+    """(n,): over values (n, 2) of t and a rate, up to each."""
+    steps = np.diff(values[:, 0]) * 0.5 * (values[1:, 1] + values[:-1, 1])
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _of_learned(seen: Seen, known: set[str]) -> Iterator[Diagnosis]:

@@ -93,6 +93,8 @@ def replay(
             at = int(stop)
             if progress is not None:
                 progress(at)
+        if health is not None and isinstance(given, WheelOdometry):
+            health.wheels(given)
         if health is not None and isinstance(given, PoseFix):
             health.arrived(given)
             if given.arrival >= due:

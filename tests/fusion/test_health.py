@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from fusion.consistency import interpolate, track_error
 from fusion.health import Health
 from fusion.localiser import Localiser
-from fusion.measurements import Outcome
+from fusion.measurements import Outcome, WheelOdometry
 from fusion.params import GRAVITY, FilterParams
 from fusion.simulator import (
     CameraParams,
@@ -23,6 +23,7 @@ from fusion.simulator import (
     Simulation,
     Trajectory,
     TriadParams,
+    WheelParams,
     WrongMarker,
     aggressive,
     figure_eight,
@@ -37,8 +38,11 @@ PARAMS = FilterParams(time_offset_sigma=0.05, tilt_sigma=0.035)
 
 def watch(simulation: Simulation, motion="ground", params=PARAMS) -> Health:
     health = Health(Localiser("robot", params, motion))
+    # Ten readings of the wheels come together, with the last of them.
+    groups = [simulation.wheels[i : i + 10] for i in range(0, len(simulation.wheels), 10)]
+    wheels = tuple(WheelOdometry("robot", float(group[-1, 0]), group) for group in groups)
     replay(
-        Recording("robot", simulation.samples, simulation.arrival, simulation.fixes, None),
+        Recording("robot", simulation.samples, simulation.arrival, simulation.fixes, None, wheels),
         health.localiser,
         None,
         health,
@@ -114,6 +118,10 @@ def marked(seed, degrees=0.0, shift=(0.0, 0.0, 0.0), share=0.25):
     return drive(
         seed, camera=CameraParams(wrong=WrongMarker(turn=np.radians(degrees), shift=shift, share=share, run=7.0))
     )
+
+
+def wheeled(simulation, times):
+    return replace(simulation, wheels=simulation.wheels * [1.0, times, 1.0])
 
 
 class Fault(NamedTuple):
@@ -255,6 +263,36 @@ FAULTS = {
         0.5,
         1.6,
         besides=frozenset({"resets", "no_fix", "fix_attitude_noise", "fix_position_noise"}),
+    ),
+    "wheels that slip": Fault(
+        "wheels_slip",
+        lambda s: drive(s, wheels=WheelParams(slip_rate=0.2, slip_time=0.6, slip=0.6)),
+        "times",
+        3,
+        40,
+        "differential",
+        frozenset({"resets"}),
+    ),
+    "wheels too small": Fault(
+        "wheel_speed", lambda s: wheeled(drive(s, wheels=WheelParams()), 1.04), "scale", 0.03, 0.05, "differential"
+    ),
+    "mm/s": Fault(
+        "wheel_unit",
+        lambda s: wheeled(drive(s, wheels=WheelParams()), 1000.0),
+        "times",
+        0.0009,
+        0.0011,
+        "differential",
+        NO_FIX | {"resets"},
+    ),
+    "wheels backwards": Fault(
+        "wheel_unit",
+        lambda s: wheeled(drive(s, wheels=WheelParams()), -1.0),
+        "times",
+        -1.1,
+        -0.9,
+        "differential",
+        NO_FIX | {"resets"},
     ),
     "wrong scale": Fault(
         "accel_motion",
@@ -420,6 +458,19 @@ def test_accuracy_is_of_the_channel_that_is_published():
     assert accuracy["mm_p95"] == pytest.approx(1e3 * np.percentile(distances, 95), rel=1e-6)
     # Without anyone who listens it is that of the track.
     assert watch(simulation).figures(60.0)["accuracy"]["channel"] == "best"
+
+
+def test_what_wheels_are_found_to_be():
+    """A scale of theirs is drawn for each, of 2 %: that shows in the speed, and more in the turning."""
+    right, wrong = (
+        watch(drive(2, wheels=WheelParams(scale_sigma=sigma)), "differential").figures(90.0) for sigma in (0.0, 0.02)
+    )
+    for figures in (right, wrong):
+        assert 0.0 < max(figures["wheel_scale_sigma"]) < 0.02
+        assert len(figures["wheel_scale"]) == 2
+    assert np.abs(right["wheel_scale"]).max() < 0.015
+    assert np.abs(wrong["wheel_scale"]).max() > 0.015
+    assert watch(drive(2, wheels=WheelParams()), "differential").said == {}
 
 
 def test_rejects_count_when_the_filter_gives_in():
