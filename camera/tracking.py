@@ -37,7 +37,7 @@ REMEMBERED = 1.0
 # Sigma of where a marker is by what it did before, px, and of how it may speed up or turn meanwhile, in sides of the
 # marker per s²: 3 m/s² for one of 14 cm.
 _SIGMA_PX, _SWERVE = 1.0, 20.0
-# Frames in a row without a marker after which it is no longer looked for in every one, nor where it was.
+# Frames in a row without a marker after which it is no longer looked for in every one.
 _GIVEN_UP = 5
 # Frames, and s, between two searches of the whole picture while a marker is missing.
 SEARCH_EVERY, SEARCH_INTERVAL = 10, 0.5
@@ -141,7 +141,10 @@ class MarkerTracker:
         if missed:
             found |= self._look_nearby(picture, missed)
         self._since_search += 1
-        if missing := self.ids - found.keys() - resting - elsewhere:
+        at_rest = self._still & self._tracks.keys()
+        # While one of them is where it was, the camera is too, and another that is not seen is hidden, not lost.
+        hidden = at_rest - found.keys() if at_rest & found.keys() else frozenset()
+        if missing := self.ids - found.keys() - hidden - elsewhere:
             due = self._since_search >= SEARCH_EVERY or not 0.0 <= t - self._searched < SEARCH_INTERVAL
             if due or any(self._missed.get(id) == 0 for id in missing):
                 found = self._search(picture, found, missing)
@@ -176,8 +179,13 @@ class MarkerTracker:
         return {
             id: where
             for id, where in expected.items()
-            if id not in self.repeated and id not in resting and self._missed.get(id, 0) <= _GIVEN_UP
+            if id not in self.repeated and id not in resting and self._worth_a_look(id)
         }
+
+    def _worth_a_look(self, id: int) -> bool:
+        """In every frame, if it was seen lately, else now and then."""
+        missed = self._missed.get(id, 0)
+        return missed <= _GIVEN_UP or missed % SEARCH_EVERY == 0
 
     def _continued(self, id: int, t: float) -> Prediction | None:
         """Where a marker is that was seen lately, if it goes on as it did."""

@@ -143,3 +143,22 @@ def test_what_is_predicted_out_of_the_picture_is_not_searched():
         prediction = {7: Prediction(truth + shift, 2.0)}
         assert tracker.track(EMPTY, 0.0, predictions=prediction) == []
         assert len(tracker.track(image, 1.0, predictions=prediction)) == found
+
+
+def test_a_hidden_anchor_costs_no_search_and_is_seen_when_it_is_free_again():
+    def anchors(*places):
+        poses = {id: transform(np.eye(3), [x, 0.2, 0.0]) for id, x in enumerate(places)}
+        return ROOM.render({id: (SIZE, pose, pose) for id, pose in poses.items()})
+
+    tracker = MarkerTracker("4X4_50", ids=[0, 1], still=[0, 1])
+    both = anchors(-0.3, 0.3)
+    for k in range(2):
+        assert len(tracker.track(both, k / RATE_HZ)) == 2
+    # Somewhere else it is not found, since it is not searched, ...
+    moved = anchors(-0.3, 0.8)
+    assert [len(tracker.track(moved, k / RATE_HZ)) for k in range(2, 25)] == [1] * 23
+    assert any(len(tracker.track(both, (25 + k) / RATE_HZ)) == 2 for k in range(SEARCH_EVERY))
+    # ... unless it stays there, ...
+    assert len(tracker.track(moved, 10.0)) == 2
+    # ... and if no other one is where it was either, the camera has moved, and a search finds them.
+    assert len(tracker.track(anchors(-0.6, -0.1), 10.1)) == 2
