@@ -22,6 +22,7 @@ from fusion.simulator import (
     CameraParams,
     MarkerParams,
     Simulation,
+    WheelParams,
     WrongMarker,
     aggressive,
     random_ground,
@@ -271,6 +272,48 @@ def test_an_imu_that_tells_nonsense_for_a_while_is_better_than_none(change):
             simulation = samples(healthy(motion, seed), change)
             run = drive(simulation, None, motion)
             assert run.mm(SETTLED) < held_mm(simulation, SETTLED)
+
+
+# --- The wheels
+
+
+def test_wheels_make_it_better_and_carry_it_without_the_camera():
+    """Their scale is wrong by a few percent each, which is found."""
+    for seed in SEEDS:
+        wheels = WheelParams(scale_sigma=0.02)
+        with_them, without = (healthy("differential", seed, 60.0, wheels=each) for each in (wheels, None))
+        assert drive(with_them, None, "differential").mm(SETTLED) < drive(without, None, "differential").mm(SETTLED)
+        lost = fixes(with_them, lambda fix: None if between(fix.t, 15.0) else fix)
+        assert drive(lost, None, "differential").error(AT).position.max() < 0.15
+
+
+CONTRADICTED = pytest.mark.xfail(strict=True, reason="wheels are believed, not the fixes: 1 to 2 m, 12 resets")
+
+
+@pytest.mark.parametrize(
+    "factors",
+    [
+        pytest.param((-1.0, 1.0), id="backwards", marks=CONTRADICTED),
+        pytest.param((1.0, -1.0), id="turning the other way"),
+        pytest.param((1000.0, 1.0), id="mm/s"),
+        pytest.param((1.0, 57.3), id="deg/s"),
+        pytest.param((0.0, 0.0), id="nothing but zeros", marks=CONTRADICTED),
+    ],
+)
+def test_wheels_that_are_altogether_wrong_do_no_harm(factors):
+    for seed in SEEDS:
+        simulation = healthy("differential", seed, wheels=WheelParams())
+        wrong = replace(simulation, wheels=simulation.wheels * [1.0, *factors])
+        run = drive(wrong, None, "differential")
+        assert run.mm(AT) < held_mm(simulation, AT)
+        assert run.localiser.latest.reset_id <= 1
+
+
+def test_wheels_that_slip():
+    for seed in range(4):
+        wheels = WheelParams(slip_rate=0.2, slip_time=0.6, slip=0.6)
+        simulation = healthy("differential", seed, wheels=wheels)
+        assert drive(simulation, None, "differential").mm(SETTLED) < 0.5 * held_mm(simulation, SETTLED)
 
 
 # --- The smooth channel
