@@ -30,8 +30,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, types
+from numba import njit, types
 from numba.extending import intrinsic
+from numba.np.numpy_support import carray
 
 from fusion.measurements import Array
 from fusion.params import GRAVITY
@@ -234,7 +235,10 @@ _fused: Any = njit(cache=True, error_model="numpy", nogil=True, fastmath={"contr
 _inline: Any = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 
 
-@intrinsic
+_intrinsic: Any = intrinsic
+
+
+@_intrinsic
 def _pointer(_context: Any, _address: Any) -> Any:
     """An address as a pointer to float64."""
     result = types.CPointer(types.float64)
