@@ -1,8 +1,9 @@
 """What is wrong with a robot's localisation, in words, with the numbers that say so.
 
 Nothing is said unless it is both large enough to matter and significant; the thresholds stand together below. Most
-tests do not need the filter to be right: they compare samples with each other, fixes at rest with each other, or the
-rotation between fixes with the gyroscope's. Where an IMU is wrong altogether its consequences are not told as causes.
+tests do not need the filter to be right: they compare samples with each other, fixes at rest with each other, the
+rotation between fixes with the gyroscope's, and the way between them with the heading and the wheels. Where an IMU is
+wrong altogether its consequences are not told as causes.
 """
 
 from __future__ import annotations
@@ -68,7 +69,11 @@ BLOCK = 32  # samples
 
 BELIEVED = (Outcome.ACCEPTED, Outcome.INFLATED)
 _SENSORS = (("gyro", "gyroscope", "rad/s", slice(0, 3)), ("accel", "accelerometer", "m/s2", slice(3, 6)))
-_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates", "wheel_unit"}
+_WHEEL_CAUSES = "a unit, a sign, the wheels' radius or distance, or an encoder that tells nothing"
+_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates"} | {
+    "wheel_unit",
+    "wheel_turn_unit",
+}
 _BESIDES = {"imu_missing", "imu_stamps_repeat", "no_fix", "fixes_lost", "fixes_late", "fixes_early"}
 _EIGHT = ("+x", "+x and +y", "+y", "-x and +y", "-x", "-x and -y", "-y", "+x and -y")
 
@@ -163,7 +168,8 @@ def diagnose(seen: Seen) -> list[Diagnosis]:
         in_doubt = not gyro and (turns is None or _agreement(turns) < 0.8)
         found += [*_of_samples(seen, blocks, in_doubt), *_of_gravity(fixes, blocks), *gyro, *_of_rest(seen, blocks)]
     found += _of_arrivals(seen)
-    wheels = list(_of_wheels(seen, blocks)) if seen.chunks else []
+    # They are compared with the gyroscope, which must be right for that.
+    wheels = list(_of_wheels(seen, blocks)) if seen.chunks and not gyro else []
     found += [diagnosis for diagnosis in wheels if diagnosis.code in _ROOTS]
     codes = {diagnosis.code for diagnosis in found}
     for causes, besides in (({"imu_stamp_unit"}, set()), ({"fixes_clock"}, set()), (_ROOTS, _BESIDES)):
@@ -434,15 +440,14 @@ def _of_wheels(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
         expected = np.diff(way) * np.sinc(turned / (2.0 * math.pi))  # the chord of an arc
         noise = np.sqrt([2.0 * fix.pose.covariance[0, 0] for fix in fixes[1:]])
         inside = (np.diff(t) <= WAY_STEP) & (t[:-1] >= speed[0, 0]) & (t[1:] <= speed[-1, 0])
-        moving = inside & (np.abs(expected) > 10.0 * noise)
+        moving = inside & (np.abs(ahead) > 10.0 * noise)
         if np.sum(moving) >= WAY_PAIRS:
-            scale = float(np.median(ahead[moving] / expected[moving]))
+            scale = float(np.median(expected[moving] / ahead[moving]))
             if not WHEEL_RANGE[0] < scale < WHEEL_RANGE[1]:
-                text = f"the robot goes {scale:.3g} x as far in its fixes as by its wheels: their unit, sign or radius"
-                evidence = {"times": scale, "pairs": int(np.sum(moving))}
-                yield Diagnosis("wheel_unit", "error", text, evidence)
+                text = f"by its wheels the robot goes {scale:.3g} x as far as in its fixes: {_WHEEL_CAUSES}"
+                yield Diagnosis("wheel_unit", "error", text, {"times": scale, "pairs": int(np.sum(moving))})
                 return
-            off = (ahead - scale * expected)[inside]
+            off = (ahead - expected / scale)[inside]
             spread = np.maximum(noise[inside], 1.4826 * float(np.median(np.abs(off))))
             slips = np.abs(off) > np.maximum(6.0 * spread, SLIP_LEAST[0])
             times += int(np.sum(slips[1:] & ~slips[:-1]))
@@ -453,7 +458,12 @@ def _of_wheels(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
         gyro = blocks[inside, 4] - seen.localiser.gyro_bias[2]
         turning = np.abs(gyro) > 0.2
         if np.sum(turning) >= WAY_PAIRS:
-            off = turns - float(np.median(turns[turning] / gyro[turning])) * gyro
+            scale = float(np.median(turns[turning] / gyro[turning]))
+            if not WHEEL_RANGE[0] < scale < WHEEL_RANGE[1]:
+                text = f"by its wheels the robot turns {scale:.3g} x as fast as by the gyroscope: {_WHEEL_CAUSES}"
+                yield Diagnosis("wheel_turn_unit", "error", text, {"times": scale, "blocks": int(np.sum(turning))})
+                return
+            off = turns - scale * gyro
             slips = np.abs(off) > max(8.0 * 1.4826 * float(np.median(np.abs(off))), SLIP_LEAST[1])
             times += int(np.sum(slips[1:] & ~slips[:-1]))
             most = float(np.max(np.abs(off)[slips], initial=0.0))

@@ -120,8 +120,9 @@ def marked(seed, degrees=0.0, shift=(0.0, 0.0, 0.0), share=0.25):
     )
 
 
-def wheeled(simulation, times):
-    return replace(simulation, wheels=simulation.wheels * [1.0, times, 1.0])
+def wheeled(seed, speed, rate=1.0):
+    simulation = drive(seed, wheels=WheelParams())
+    return replace(simulation, wheels=simulation.wheels * [1.0, speed, rate])
 
 
 class Fault(NamedTuple):
@@ -139,6 +140,7 @@ NOISY_ACCEL = ImuParams(accel=TriadParams(noise=6e-2, bias_sigma=0.2, bias_walk=
 WEAK_GYRO = ImuParams(gyro=TriadParams(noise=1e-3, bias_sigma=0.02, limit=2.18))
 WRONG_ACCEL = ImuParams(accel=TriadParams(noise=2e-2, bias_sigma=0.2, bias_walk=1e-3, scale_sigma=0.3))
 NO_FIX = frozenset({"no_fix"})
+GIVEN_UP = NO_FIX | {"resets"}
 SWAYING = np.array([[[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]], [[1.0, 0.4, 0.0]]])  # it looks now to the left, now right
 FAULTS = {
     "stamps late": Fault("stamps", lambda s: drive(s, camera=CameraParams(stamp_error=0.032)), "late_ms", 25, 39),
@@ -273,27 +275,11 @@ FAULTS = {
         "differential",
         frozenset({"resets"}),
     ),
-    "wheels too small": Fault(
-        "wheel_speed", lambda s: wheeled(drive(s, wheels=WheelParams()), 1.04), "scale", 0.03, 0.05, "differential"
-    ),
-    "mm/s": Fault(
-        "wheel_unit",
-        lambda s: wheeled(drive(s, wheels=WheelParams()), 1000.0),
-        "times",
-        0.0009,
-        0.0011,
-        "differential",
-        NO_FIX | {"resets"},
-    ),
-    "wheels backwards": Fault(
-        "wheel_unit",
-        lambda s: wheeled(drive(s, wheels=WheelParams()), -1.0),
-        "times",
-        -1.1,
-        -0.9,
-        "differential",
-        NO_FIX | {"resets"},
-    ),
+    "wheels too small": Fault("wheel_speed", lambda s: wheeled(s, 1.04), "scale", 0.03, 0.05, "differential"),
+    "mm/s": Fault("wheel_unit", lambda s: wheeled(s, 1000.0), "times", 900, 1100, "differential", GIVEN_UP),
+    "wheels backwards": Fault("wheel_unit", lambda s: wheeled(s, -1.0), "times", -1.1, -0.9, "differential", GIVEN_UP),
+    "dead wheels": Fault("wheel_unit", lambda s: wheeled(s, 0.0), "times", -0.1, 0.1, "differential", GIVEN_UP),
+    "deg/s of wheels": Fault("wheel_turn_unit", lambda s: wheeled(s, 1.0, 57.3), "times", 50, 64, "differential"),
     "wrong scale": Fault(
         "accel_motion",
         lambda s: drive(s, imu=WRONG_ACCEL),
