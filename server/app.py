@@ -12,6 +12,7 @@ import contextlib
 import functools
 import logging
 import math
+import secrets
 import socket
 import threading
 import time
@@ -690,16 +691,16 @@ class Service:
 
     async def _serve_camera(self, visitor: _Visitor) -> None:
         hello = await self._hello(visitor, camera_hello)
+        token = hello.token or bearer(visitor.headers)
         camera = self.cameras.get(hello.camera)
         if camera is None and not visitor.local:
-            raise RefusedError("there is no such camera, or this is not its token")
+            await self._admit(visitor, token, secrets.token_hex(), f'camera "{hello.camera}"')
         if not isinstance(camera, RemoteCamera):
             known = ", ".join(name for name, camera in self.cameras.items() if isinstance(camera, RemoteCamera))
             raise RefusedError(
                 f'there is no remote camera "{hello.camera}" in the configuration (source = "remote"); '
                 f"known: {known or 'none'}"
             )
-        token = hello.token or bearer(visitor.headers)
         await self._admit(visitor, token, camera.config.token, f'camera "{hello.camera}"')
         if taken := camera.refusal(time.monotonic()):
             raise RefusedError(taken, retry=True)
@@ -710,12 +711,13 @@ class Service:
     async def _serve_robot(self, visitor: _Visitor) -> None:
         hello = await self._hello(visitor, decode_hello)
         visitor.dialect = Dialect(hello, visitor.dialect.binary)
-        robot = self.robots.get(hello.robot)
-        if robot is None and not visitor.local:
-            raise RefusedError("there is no such robot, or this is not its token")
-        robot = self._known(hello.robot)
         token = hello.token or bearer(visitor.headers)
-        await self._admit(visitor, token, robot.config.token, f'robot "{hello.robot}"')
+        if hello.robot in self.robots or visitor.local:
+            configured = self._known(hello.robot).config.token
+        else:
+            configured = secrets.token_hex()  # which names there are is not told to everybody
+        await self._admit(visitor, token, configured, f'robot "{hello.robot}"')
+        robot = self._known(hello.robot)
         if robot.config.imu.source != "websocket":
             raise RefusedError(f'the IMU of "{hello.robot}" is on {robot.config.imu.source}, by the configuration')
         link = self._take(robot, visitor)
