@@ -109,8 +109,11 @@ def test_a_robot_without_a_token_is_taken_from_this_machine_only() -> None:
             async with client(service, "/v1/robot") as connection:
                 assert (await hello(connection, "cart"))["type"] == "welcome"
             async with elsewhere(service, "/v1/robot") as connection:
-                said = await reason(connection, {"type": "hello", "robot": "tank"})
-                assert "rover" not in said, "names are not for everybody"
+                # Which names there are is not for everybody.
+                assert 'robot "tank" needs its token' in await reason(connection, {"type": "hello", "robot": "tank"})
+            async with elsewhere(service, "/v1/robot") as connection:
+                said = await reason(connection, {"type": "hello", "robot": "tank", "token": "guessed"})
+                assert said == 'this is not the token of robot "tank"'
 
     run(main)
 
