@@ -316,7 +316,7 @@ def test_ctrl_c_writes_what_is_there_only_if_forced(film: Path, tmp_path: Path, 
 def test_the_page_shows_what_to_do_and_the_end(film: Path, tmp_path: Path) -> None:
     if not CHROMIUM.exists():
         pytest.skip(f"{CHROMIUM} is not installed")
-    # So that the browser is there in time: at first, for long, there is nothing but an empty picture.
+    # The camera's first picture is a pipe, so that it waits until the browser is there.
     folder = tmp_path / "slow"
     folder.mkdir()
     pipe = folder / "000.png"
@@ -337,10 +337,8 @@ def test_the_page_shows_what_to_do_and_the_end(film: Path, tmp_path: Path) -> No
                     address = await asyncio.to_thread(running.wait_for, "http://")
                     await page.goto(address.split()[0])
                     await page.evaluate(WATCH)
-                    # Now the camera may begin: whoever reads the pipe gets a first, empty picture.
-                    await asyncio.to_thread(
-                        pipe.write_bytes, cv2.imencode(".png", np.full((480, 640), 90, np.uint8))[1]
-                    )
+                    # Now the camera may begin: what comes out of the pipe is no picture, and is passed over.
+                    await asyncio.to_thread(lambda: pipe.open("wb").close())
                     await see(page, "document.querySelectorAll('#criteria li').length === 8")
                     await see(page, "document.getElementById('picture').width === 640")
                     assert await page.inner_text("#board") == BOARD
