@@ -161,6 +161,7 @@ FAULTS = {
         "turn_deg",
         175,
         180,
+        besides=frozenset({"resets"}),
     ),
     "flipped": Fault("fixes_flipped", lambda s: drive(s, camera=CameraParams(flip=0.2)), "tip_deg", 20, 90),
     "two cameras": Fault("cameras_disagree", lambda s: two_cameras(s, 0.02), "mm", 15, 25),
@@ -244,7 +245,7 @@ FAULTS = {
         "free",
     ),
     "heading of the only marker": Fault(
-        "marker_heading", lambda s: marked(s, -5.0, share=1.0), "off_deg", 4.5, 5.5, "differential"
+        "marker_heading", lambda s: marked(s, -5.0, share=1.0), "off_deg", 4.2, 5.8, "differential"
     ),
     "the only marker before the axle": Fault(
         "marker_place", lambda s: marked(s, shift=(0.1, 0.0, 0.0), share=1.0), "mm", 90, 110, "differential"
