@@ -78,12 +78,13 @@ class Prediction:
 
 @dataclass(slots=True)
 class _Track:
-    """A marker as last seen. `t`: when; `decoded`: when it was last told from all others, s."""
+    """A marker as last seen. `t`: when; `earlier`: when and where before; `decoded`: when it was last told from all
+    others, s."""
 
     t: float
     corners_px: Array
     sigma_px: float
-    velocity_px: Array
+    earlier: tuple[float, Array] | None
     blur_px: float
     decoded: float
 
@@ -129,11 +130,7 @@ class MarkerTracker:
         in_view = [id for id in self._still & self._tracks.keys() if self._missed[id] <= _GIVEN_UP]
         resting = frozenset(sorted(in_view, key=lambda id: self._tracks[id].t)[STILL_AT_ONCE:])
         predictions = predictions or {}
-        elsewhere = {
-            id
-            for id, where in predictions.items()
-            if _box(where.corners_px, 3.0 * where.sigma_px, picture.shape) is None
-        }
+        elsewhere = _out_of_picture(predictions, picture.shape)
         expected = self._expected(t, predictions, resting)
         found = self._follow(picture, t, expected)
         # Where a prediction did not help, it may be wrong, and the robot where it was.
@@ -155,7 +152,7 @@ class MarkerTracker:
         self._remember(found, t, resting)
         return [
             MarkerSighting(
-                t + line_time * float(marker.corners_px[:, 1].mean()),
+                t + line_time * float(marker.corners_px[:, 1].mean()) if line_time else t,
                 camera,
                 id,
                 marker.corners_px,
@@ -197,9 +194,12 @@ class MarkerTracker:
         dt = t - track.t
         if not 0.0 <= dt <= REMEMBERED:
             return None
+        corners = track.corners_px
+        if track.earlier is not None and 0.0 < track.t - track.earlier[0] <= REMEMBERED:
+            corners = corners + (corners - track.earlier[1]) * (dt / (track.t - track.earlier[0]))
         side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
         sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
-        return Prediction(track.corners_px + track.velocity_px * dt, sigma, track.sigma_px)
+        return Prediction(corners, sigma, track.sigma_px)
 
     def _follow(self, picture: Image, t: float, expected: Mapping[int, Prediction]) -> dict[int, Found]:
         """Those whose place and identity are known well enough for a look at their edges."""
@@ -248,8 +248,10 @@ class MarkerTracker:
         cheap = (_LONG, _SHORT) if shortest >= _LONG_PX else (_SHORT,) if shortest >= _SHORT_PX else (_TINY,)
         hard = _HARD if self.sides_px is not None and shortest >= _SHORT_PX else _HARD_AND_TINY
         last = hard[self._hard % len(hard)]
-        anything = SMALLEST_SIDE_PX, math.inf
-        expected = anything if self.sides_px is None else _about(shortest, longest)
+        expected = nearly = SMALLEST_SIDE_PX, math.inf
+        if self.sides_px is not None:
+            # The thorough look is at much else, too, lest a size in the configuration is wrong.
+            expected, nearly = _about(shortest, longest), (max(0.4 * shortest, SMALLEST_SIDE_PX), math.inf)
         seen = list(found.values())
         if self.repeated or not missing:
             # The best of them: the others may see one of two.
@@ -258,8 +260,7 @@ class MarkerTracker:
             if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
             before = len(seen)
-            # The thorough look is at everything, lest a size in the configuration is wrong.
-            seen = distinct(seen + self._detector.look(picture, way, anything if way == _THOROUGH else expected))
+            seen = distinct(seen + self._detector.look(picture, way, nearly if way == _THOROUGH else expected))
             if set(missing) <= {marker.id for marker in seen}:
                 break
         else:
@@ -275,12 +276,19 @@ class MarkerTracker:
             self._missed[id] += id not in resting
         for id, marker in found.items():
             before = self._tracks.get(id)
-            velocity = np.zeros((4, 2))
-            if before is not None and 0.0 < t - before.t <= REMEMBERED:
-                velocity = (marker.corners_px - before.corners_px) / (t - before.t)
+            earlier = None if before is None else (before.t, before.corners_px)
             decoded = t if marker.decoded or before is None else before.decoded
-            self._tracks[id] = _Track(t, marker.corners_px, marker.sigma_px, velocity, marker.blur_px, decoded)
+            self._tracks[id] = _Track(t, marker.corners_px, marker.sigma_px, earlier, marker.blur_px, decoded)
             self._missed[id] = 0
+
+
+def _out_of_picture(predictions: Mapping[int, Prediction], shape: tuple[int, ...]) -> set[int]:
+    if not predictions:
+        return set()
+    corners = np.array([where.corners_px for where in predictions.values()])
+    margin = 3.0 * np.array([where.sigma_px for where in predictions.values()])[:, None]
+    out = (corners.max(axis=1) < -margin) | (corners.min(axis=1) > np.array(shape[1::-1]) + margin)
+    return {id for id, (x, y) in zip(predictions, out.tolist(), strict=True) if x or y}
 
 
 def _about(shortest_px: float, longest_px: float) -> tuple[float, float]:
