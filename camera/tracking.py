@@ -230,7 +230,7 @@ class MarkerTracker:
             left = {id: where for id, where in missed.items() if id not in found}
             boxes, sides = [], []
             for where in left.values():
-                side = float(np.linalg.norm(where.corners_px[1] - where.corners_px[0]))
+                side = max(float(np.linalg.norm(where.corners_px[1] - where.corners_px[0])), SMALLEST_SIDE_PX)
                 margin = 0.25 * side + 3.0 + 3.0 * where.sigma_px
                 if (box := _box(where.corners_px, margin, picture.shape)) is not None:
                     boxes.append(box)

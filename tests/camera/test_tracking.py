@@ -162,3 +162,22 @@ def test_a_hidden_anchor_costs_no_search_and_is_seen_when_it_is_free_again():
     assert len(tracker.track(moved, 10.0)) == 2
     # ... and if no other one is where it was either, the camera has moved, and a search finds them.
     assert len(tracker.track(anchors(-0.6, -0.1), 10.1)) == 2
+
+
+def test_predictions_that_can_be_of_no_use_do_no_harm():
+    image, truth = seen(drive(0))
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    useless = [np.full((4, 2), 5.0), truth[::-1], truth + 1e9, 1e-3 * truth]
+    for k, corners in enumerate(useless):
+        predictions = {7: Prediction(corners, 1.0), 3: Prediction(truth, 1e6)}
+        (sighting,) = tracker.track(image, k / RATE_HZ, predictions=predictions)
+        assert np.abs(sighting.corners_px - truth).max() < 0.25
+
+
+def test_pictures_without_anything_and_of_another_size():
+    tracker = MarkerTracker("4X4_50", ids=[7])
+    image, _ = seen(drive(0))
+    tracker.track(image, 0.0)
+    for k, picture in enumerate((np.zeros((1, 1), np.uint8), image[:5], np.full_like(image, 255), image[:100, :100])):
+        assert tracker.track(picture, (k + 1) / RATE_HZ) == []
+    assert MarkerTracker("4X4_50", ids=[]).track(image, 0.0) == []
