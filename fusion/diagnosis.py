@@ -273,6 +273,9 @@ def _of_arrivals(seen: Seen) -> Iterator[Diagnosis]:
     buffer = localiser.params.buffer
     if lost >= LATE_FIXES and lost >= LATE_SHARE * (lost + len(fixes)):
         text = f"{lost} of {lost + len(fixes)} fixes came later than the buffer of {buffer:g} s and are lost"
+        if (after := float(np.median(seen.lost))) < buffer:
+            text = f"{lost} of {lost + len(fixes)} fixes came {after:.1f} s late and are lost: at this rate of the IMU "
+            text += "so much is not kept"
         yield Diagnosis("fixes_lost", "error", text, {"lost": lost, "fixes": lost + len(fixes), "buffer_s": buffer})
     elif len(delays) >= TURNED_FIXES and (p95 := float(np.percentile(delays, 95))) > LATE_OF_BUFFER * buffer:
         text = f"fixes arrive {p95:.1f} s late: beyond the buffer of {buffer:g} s they are lost"

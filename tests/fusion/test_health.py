@@ -382,6 +382,15 @@ def test_nothing_is_said_of_other_imus(imu):
     assert watch(drive(4, imu=imu)).said == {}
 
 
+def test_fixes_that_are_lost_because_the_imu_is_too_fast():
+    """At 8 kHz what is kept of the samples is half a second."""
+    simulation = simulate(
+        random_ground(0), 0, 8.0, ImuParams(rate=8000.0), CameraParams(delay_least=0.6, delay_most=0.7)
+    )
+    (diagnosis,) = [diagnosis for diagnosis in watch(simulation).diagnoses(8.0) if diagnosis.code == "fixes_lost"]
+    assert "at this rate of the IMU" in diagnosis.text
+
+
 # --- figures
 
 
