@@ -92,6 +92,7 @@ STILL_FORCE = AUX + 85  # m/s2: mean specific force since it is at rest (3)
 SYSTEMATIC = AUX + 88  # covariance of what the last fix taken had wrong in common with all others, world axes (36)
 TWINS = AUX + 124  # 1 while the shadow is the other pose of the first fix
 LEAD = AUX + 125  # by how much the scores of the fixes since then favour the filter over it
+WHEEL_DOUBT = AUX + 128  # by how much more the variance of wheels is, since fixes have contradicted what came of them
 FORCE_MEAN = AUX + 126  # m/s2: mean magnitude of the specific force,
 FORCE_COUNT = AUX + 127  # over so many samples
 CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
@@ -100,7 +101,7 @@ PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (
 PLACE_COUNT = AUX + 82
 ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
 T_ADAPTED = AUX + 62  # s: the last of them
-STATE = AUX + 128
+STATE = AUX + 129
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -211,6 +212,8 @@ STILL_PAUSE = 2.0  # s: and for so long it is believed
 LEAST_CONSTRAINT = 0.005  # of a constraint's variance is believed where it is kept ever so well
 WRONG_SCALE = 0.2  # of gravity: no bias is so large
 FORCE_SAMPLES = 1000
+DOUBTED, TRUSTED_AGAIN, MOST_DOUBT = 10.0, 0.95, 1e4  # factors of the variance of wheels, for each fix
+IN_USE = 1.0  # s: wheels have told something so lately
 SLIPS = 9.0  # squared innovation of wheels over the expected one: more is no noise
 STUCK_AFTER = 8  # samples that repeat each other to the last digit: nobody measures
 SPIKE = 20.0  # times the usual change, and more than these: one sample alone is held to be lost
@@ -884,6 +887,11 @@ def _judge(s, prm, fix):
             if fix[F_D2_POSITION] > LEAVE_STILL:
                 s[STILL_SINCE] = math.inf
                 s[STILL_BARRED] = s[T] + STILL_PAUSE
+            if s[T] - s[T_WHEEL] < IN_USE:
+                # A dead encoder, or a reversed one, agrees with itself.
+                contradicted = fix[F_D2_POSITION] > prm[GATE_BLOCK]
+                doubt = s[WHEEL_DOUBT] * (DOUBTED if contradicted else TRUSTED_AGAIN)
+                s[WHEEL_DOUBT] = min(max(doubt, 1.0), MOST_DOUBT)
             fix[F_OUTCOME] = INFLATED if ratio > 1.0 else ACCEPTED
         if ratio > prm[GATE_INFLATION]:
             if o == MAIN and fix[F_D2_POSITION] <= prm[GATE_BLOCK]:
@@ -1164,7 +1172,7 @@ def _odometry(s, prm, reading):
                 H[m, DBG + 2] = -scale
             H[m, DWHEEL + i] = value
             y[m] = reading[1 + i] - scale * value
-            variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share
+            variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share * s[WHEEL_DOUBT]
             if o == MAIN:
                 expected = variance
                 for c in range(N):
@@ -1211,13 +1219,8 @@ def _next_sample(s, prm, imu, k):
     s[BRIDGING] = 1.0 if t - s[T_IMU] > prm[IMU_GAP] else 0.0
     # On the floor what is felt is gravity, on the mean: where it is far from that the scale is wrong.
     scale = 1.0
-    if prm[MOTION] != FREE:
-        size = math.sqrt(imu[row, 4] * imu[row, 4] + imu[row, 5] * imu[row, 5] + imu[row, 6] * imu[row, 6])
-        n = min(s[FORCE_COUNT] + 1.0, FORCE_SAMPLES)
-        s[FORCE_COUNT] = n
-        s[FORCE_MEAN] += (min(size, 10.0 * GRAVITY) - s[FORCE_MEAN]) / n
-        if abs(s[FORCE_MEAN] / GRAVITY - 1.0) > WRONG_SCALE:
-            scale = GRAVITY / max(s[FORCE_MEAN], 0.01 * GRAVITY)
+    if prm[MOTION] != FREE and s[FORCE_COUNT] > 0.0 and abs(s[FORCE_MEAN] / GRAVITY - 1.0) > WRONG_SCALE:
+        scale = GRAVITY / max(s[FORCE_MEAN], 0.01 * GRAVITY)
     gyro, accel = 0.0, 0.0
     saturated = False
     for i in range(6):
@@ -1232,7 +1235,13 @@ def _next_sample(s, prm, imu, k):
         ):
             s[CLIPPED + i // 3] += 1.0
             saturated |= s[CLIPPED + i // 3] >= CLIPPED_OFTEN
-    s[SAME_RUN] = s[SAME_RUN] + 1.0 if gyro + accel == 0.0 else 0.0
+    if gyro + accel == 0.0:
+        s[SAME_RUN] += 1.0
+    else:
+        s[SAME_RUN] = 0.0
+        size = math.sqrt(imu[row, 4] * imu[row, 4] + imu[row, 5] * imu[row, 5] + imu[row, 6] * imu[row, 6])
+        s[FORCE_COUNT] = min(s[FORCE_COUNT] + 1.0, FORCE_SAMPLES)
+        s[FORCE_MEAN] += (min(size, 10.0 * GRAVITY) - s[FORCE_MEAN]) / s[FORCE_COUNT]
     if s[SAME_RUN] >= STUCK_AFTER:
         s[BRIDGING] = 1.0
     spike = gyro > max(SPIKE * SPIKE * s[CHANGE_GYRO], SPIKE_GYRO * SPIKE_GYRO)
@@ -1310,7 +1319,7 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                         az = GRAVITY * az + s[o + BA + 2]
                         rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
                         if turns:
-                            rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
+                            rate_noise = prm[WHEEL_RATE_SIGMA] * math.sqrt(s[WHEEL_DOUBT] / GRID_HZ)
                     predict(
                         s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt,
                         rate_noise, force_noise, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK],
@@ -1833,6 +1842,7 @@ def new_memory(parameters: Array) -> Array:
     state[STILL_BARRED] = state[T_ADAPTED] = state[GRID_AT] = -math.inf
     state[SCALE : SCALE + 4] = state[CONSTRAINT_NIS : CONSTRAINT_NIS + 4] = 1.0
     state[USUAL_SPEED2] = prm[USUAL_SPEED] ** 2
+    state[WHEEL_DOUBT] = 1.0
     checkpoints[0] = state
     meta[CP_END] = 1.0
     return memory

@@ -248,6 +248,8 @@ class _State:
         self.adapted, self.t_adapted = 0.0, -math.inf
         self.t_wheel, self.wheel_rate, self.wheel_share = -math.inf, 0.0, 1.0
         self.wheel_nis, self.slips = [0.0, 0.0], False  # of speed, of yaw rate
+        self.wheel_doubt = 1.0
+        self.force_mean, self.force_count = 0.0, 0
         self.systematic = np.zeros(36)
         self.place, self.place2, self.place_count = np.zeros(3), np.zeros(3), 0
 
@@ -503,6 +505,9 @@ class ReferenceTimeline:
     def _head_for(self, state: _State, sample: tuple[float, ...]) -> None:
         """See `kernels._next_sample`."""
         state.next_t, state.next_u = sample[0], np.array(sample[1:])
+        size = min(float(np.linalg.norm(state.next_u[3:])), 10.0 * GRAVITY)
+        if self._motion != "free" and state.force_count and abs(state.force_mean / GRAVITY - 1.0) > k.WRONG_SCALE:
+            state.next_u[3:] *= GRAVITY / max(state.force_mean, 0.01 * GRAVITY)
         change = (state.next_u - state.u).reshape(2, 3)
         squared = (change * change).sum(axis=1).tolist()
         state.clipped = list(state.clipped)
@@ -512,7 +517,11 @@ class ReferenceTimeline:
                 if change[i, axis] == 0.0 and abs(state.u[3 * i + axis]) >= max(state.largest[i], least):
                     state.clipped[i] += 1
                     saturated |= state.clipped[i] >= k.CLIPPED_OFTEN
-        state.same_run = 0 if change.any() else state.same_run + 1
+        state.same_run = state.same_run + 1
+        if change.any():
+            state.same_run = 0
+            state.force_count = min(state.force_count + 1, k.FORCE_SAMPLES)
+            state.force_mean += (size - state.force_mean) / state.force_count
         state.bridging = sample[0] - state.t_imu > self._params.imu_gap or state.same_run >= k.STUCK_AFTER
         known = state.largest[1] > 0.0
         # of both sensors: what one sample alone may change by, and what none can
@@ -558,7 +567,7 @@ class ReferenceTimeline:
             if sample is not None:
                 if not state.initialised:
                     state.accel_count = min(state.accel_count + 1, 100)
-                    step = (np.array(sample[4:]) - state.accel_mean) / state.accel_count
+                    step = (state.next_u[3:] - state.accel_mean) / state.accel_count
                     state.accel_mean = state.accel_mean + step
                 elif math.floor(t * k.GRID_HZ) != state.grid_at:
                     self._watch(state)
@@ -622,7 +631,7 @@ class ReferenceTimeline:
             # straight on, unless the wheels say how it turns
             turns = t - state.t_wheel <= p.imu_gap
             rate = [0.0, 0.0, state.wheel_rate if turns else 0.0]
-            rate_noise = p.wheel_rate_sigma / math.sqrt(k.GRID_HZ) if turns else p.no_imu_rate_noise
+            rate_noise = p.wheel_rate_sigma * math.sqrt(state.wheel_doubt / k.GRID_HZ) if turns else p.no_imu_rate_noise
             force = GRAVITY * f.rotation.T @ f.up
             f.move(f.bias + np.concatenate([rate, force]), dt, (rate_noise, 0.0, *walks))
             f.slow(dt, p.no_imu_accel_noise)
@@ -790,6 +799,9 @@ class ReferenceTimeline:
                 S, R = S + more * R, R + more * R
         if fix[k.F_D2_POSITION] > k.LEAVE_STILL:
             state.still_since, state.still_barred = math.inf, state.t + k.STILL_PAUSE
+        if state.t - state.t_wheel < k.IN_USE:
+            doubt = k.DOUBTED if fix[k.F_D2_POSITION] > p.gate_block else k.TRUSTED_AGAIN
+            state.wheel_doubt = min(max(state.wheel_doubt * doubt, 1.0), k.MOST_DOUBT)
         if ratio <= p.gate_inflation:
             self._adapt(state, figures, k.MOST_TAUGHT)
             fix[k.F_OUTCOME] = k.ACCEPTED
@@ -986,7 +998,7 @@ class ReferenceTimeline:
         for i, sigma in enumerate((p.wheel_speed_sigma, p.wheel_rate_sigma)):
             if math.isnan(y[i]) or (i == 1 and state.bridging):
                 continue
-            variance = sigma**2 * state.wheel_share
+            variance = sigma**2 * state.wheel_share * state.wheel_doubt
             if f is state.main:
                 off = y[i] ** 2 / (variance + H[i] @ f.P @ H[i])
                 state.slips |= bool(i == 1 and off > k.SLIPS)

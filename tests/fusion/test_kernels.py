@@ -23,7 +23,7 @@ def some_state(rng):
     s[k.TD] = 0.01
     s[k.TILT : k.TILT + 2] = rng.normal(0.0, 0.02, 2)
     s[k.WHEEL : k.WHEEL + 2] = [0.03, -0.05]
-    s[k.SCALE : k.SCALE + 4] = s[k.CONSTRAINT_NIS : k.CONSTRAINT_NIS + 4] = 1.0
+    s[k.SCALE : k.SCALE + 4] = s[k.CONSTRAINT_NIS : k.CONSTRAINT_NIS + 4] = s[k.WHEEL_DOUBT] = 1.0
     return s
 
 
