@@ -21,16 +21,17 @@ from fusion.params import GRAVITY, Channel, FilterParams, Motion
 from fusion.smoothing import Motion as Moving
 from fusion.smoothing import Smoother
 
-TH, DV, DP, DBG, DBA, DTD, DTILT = (
+TH, DV, DP, DBG, DBA, DTILT, DWHEEL = (
     slice(0, 3),
     slice(3, 6),
     slice(6, 9),
     slice(9, 12),
     slice(12, 15),
-    slice(15, 16),
     slice(16, 18),
+    slice(18, 20),
 )
-N = 18
+DTD = 15
+N = 20
 _I3 = np.eye(3)
 _I = np.eye(N)
 
@@ -66,6 +67,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.position = np.zeros(3)
         self.bias = np.zeros(6)  # of the IMU's sample: gyro, accel
         self.time_offset = 0.0
+        self.wheel_scale = np.zeros(2)  # of wheel odometry: errors of forward speed and yaw rate
         self.lean(np.zeros(2))
         self.corrected = np.zeros(6)  # sum of all moves by updates: position, rotation vector, world axes
 
@@ -114,6 +116,23 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.F, self.Q = F, np.array(variances).dot(_NOISE).reshape(N, N)
         self.predict()
 
+    def slow(self, dt: float, noise: float) -> None:
+        """What `move` leaves out where nothing is measured: the speed decays, and white `noise` pushes the robot."""
+        tau = k.COAST_TIME
+        e = math.exp(-dt / tau)
+        gone = tau * (1.0 - e)
+        self.position = self.position + (gone - dt) * self.velocity
+        self.velocity = e * self.velocity
+        F = _I.copy()
+        F[DV, DV], F[DP, DV] = e * _I3, (gone - dt) * _I3
+        Q = np.zeros((N, N))
+        half = 0.5 * tau * (1.0 - e * e)
+        Q[DV, DV] = half * _I3
+        Q[DV, DP] = Q[DP, DV] = 0.5 * gone**2 * _I3
+        Q[DP, DP] = tau**2 * (dt - 2.0 * gone + half) * _I3
+        self.F, self.Q = F, noise**2 * Q
+        self.predict()
+
     def correct(self, H: Array, y: Array, R: Array) -> None:
         """Update with innovation y, then move the nominal state by the error and reset it."""
         self.update(y, lambda _: H, _no_innovation, R=R)
@@ -125,8 +144,9 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.velocity = self.velocity + faster
         self.position = self.position + moved
         self.bias = self.bias + dx[9:15]
-        self.time_offset += float(dx[15])
+        self.time_offset += float(dx[DTD])
         self.lean(self.tilt + dx[DTILT])
+        self.wheel_scale = self.wheel_scale + dx[DWHEEL]
         # Jr(φ) = I - (1 - cos φ)/φ² [φ]x + (φ - sin φ)/φ³ [φ]x²
         angle, K = math.hypot(*turn.tolist()), skew(turn)
         b, c = (0.5, 1.0 / 6.0)
@@ -143,7 +163,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.rotation = R.dot(1.5 * _I3 - 0.5 * R.T.dot(R))
 
     def start(self, hypothesis: Array, velocity_sigma: float) -> None:
-        """Pose and its covariance from a fix; biases, time offset and tilt stay, uncorrelated with it."""
+        """Pose and its covariance from a fix; the other states stay, uncorrelated with it."""
         self.rotation = rotation_from_quaternion(hypothesis[k.H_QUAT : k.H_QUAT + 4])
         self.position = hypothesis[k.H_POS : k.H_POS + 3].copy()
         self.velocity = np.zeros(3)
@@ -154,6 +174,17 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         R = self._in_body(hypothesis)
         P[DP, DP], P[TH, TH] = R[:3, :3], R[3:, 3:]
         P[DP, TH], P[TH, DP] = R[:3, 3:], R[3:, :3]
+        if P.diagonal()[TH].max() > k.UNKNOWN_HEADING**2:
+            # the fix says nothing of the attitude
+            P[TH, :] = P[:, TH] = 0.0
+            P[TH, TH] = k.UNKNOWN_HEADING**2 * _I3
+        self.P = P
+
+    def reopen(self, i: int, variance: float) -> None:
+        """Forget what is known of one of the plain states."""
+        P = self.P.copy()
+        P[i, :] = P[:, i] = 0.0
+        P[i, i] = variance
         self.P = P
 
     def _in_body(self, hypothesis: Array) -> Array:
@@ -169,7 +200,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         H[:3, DP] = _I3
         H[3:, TH] = _I3
         motion = np.concatenate([self.rotation.T @ self.velocity, rate])
-        H[:, 15] = motion
+        H[:, DTD] = motion
         y = np.concatenate(
             [
                 self.rotation.T @ (hypothesis[k.H_POS : k.H_POS + 3] - self.position),
@@ -177,6 +208,11 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
             ]
         )
         return H, y, self._in_body(hypothesis) + jitter**2 * np.outer(motion, motion)
+
+
+def _order(reading: tuple[float, ...]) -> list[float]:
+    """By what readings are sorted: NaN, which compares with nothing, comes last."""
+    return [math.inf if math.isnan(number) else number for number in reading]
 
 
 def _d2(S: Array, y: Array) -> float:
@@ -196,15 +232,23 @@ class _State:
         self.next_t = math.inf
         self.next_u = np.zeros(6)
         self.bridging = self.trailing = self.initialised = False
-        self.imu_cursor = self.fix_cursor = 0
+        self.imu_cursor = self.fix_cursor = self.wheel_cursor = 0
+        self.grid_at = -math.inf
         self.td_applied = 0.0
         self.reset_id = self.accepted_count = 0
         self.accel_mean, self.accel_count = np.zeros(3), 0
         self.excess, self.scale, self.last_innovation = [0.0] * 4, [1.0] * 4, np.zeros(6)
         self.still_since, self.still_barred, self.still_sure, self.still_fixes = math.inf, -math.inf, False, 0
-        self.still_mean, self.rest, self.moving = np.zeros(3), [0.0, 0.0], [0.0, 0.0]  # of gyro and accelerometer
-        self.constraint_nis, self.usual_speed2 = np.zeros(4), 0.0
+        self.still_mean, self.still_force = np.zeros(3), np.zeros(3)
+        self.rest, self.moving = [0.0, 0.0], [0.0, 0.0]  # of gyro and accelerometer, like all pairs that follow
+        self.change, self.largest, self.clipped = [0.0, 0.0], [0.0, 0.0], [0, 0]
+        self.same_run, self.suspect, self.blind = 0, False, False
+        self.constraint_nis, self.usual_speed2 = np.ones(4), 0.0
         self.adapted, self.t_adapted = 0.0, -math.inf
+        self.t_wheel, self.wheel_rate, self.wheel_share = -math.inf, 0.0, 1.0
+        self.wheel_nis = [0.0, 0.0]  # of speed, of yaw rate
+        self.systematic = np.zeros(36)
+        self.place, self.place2, self.place_count = np.zeros(3), np.zeros(3), 0
 
     def copy(self) -> _State:
         other = copy.copy(self)
@@ -225,11 +269,12 @@ class ReferenceTimeline:
         self._motion = motion
         self._samples: list[tuple[float, ...]] = []
         self._fixes: list[Array] = []
+        self._readings: list[tuple[float, ...]] = []  # of wheels
         self._state = _State()
         self._state.usual_speed2 = params.usual_speed**2
         self._checkpoints = [self._state.copy()]
-        self._horizon = -math.inf
-        self._figures = {"imu_duplicates": 0, "imu_late": 0, "rewinds": 0}
+        self._horizon = self._ahead = -math.inf
+        self._figures = dict.fromkeys(("imu_duplicates", "imu_late", "wheel_duplicates", "wheel_late", "rewinds"), 0)
         self._waiting = 0
         self._smoother = Smoother()
 
@@ -250,7 +295,7 @@ class ReferenceTimeline:
         vector[k.POS : k.POS + 3] = s.main.position
         vector[k.BG : k.BG + 3], vector[k.BA : k.BA + 3] = s.main.bias[:3], s.main.bias[3:]
         vector[k.TD] = s.main.time_offset
-        vector[k.TILT : k.TILT + 2] = s.main.tilt
+        vector[k.TILT : k.TILT + 2], vector[k.WHEEL : k.WHEEL + 2] = s.main.tilt, s.main.wheel_scale
         vector[k.COV : k.COV + N * N] = s.main.P.ravel()
         vector[k.T], vector[k.T_IMU], vector[k.T_ACCEPTED] = s.t, s.t_imu, s.t_accepted
         vector[k.INITIALISED], vector[k.RESET_ID] = s.initialised, s.reset_id
@@ -262,7 +307,7 @@ class ReferenceTimeline:
         kept = 0
         for i, sample in enumerate(samples.tolist()):
             before = self._before()
-            kept += self._insert_sample(tuple(sample))
+            kept += self._insert("imu", self._samples, tuple(sample))
             self._advance(self._state, math.inf, live=True)
             self._absorb(before)
             if track is not None:
@@ -278,8 +323,20 @@ class ReferenceTimeline:
                 row[1:4], row[4:] = position, quaternion_from_rotation(rotation)
         return kept
 
+    def feed_wheels(self, samples: Array) -> int:
+        """See `Timeline.feed_wheels`."""
+        kept = 0
+        for reading in samples.tolist():
+            before = self._before()
+            kept += self._insert("wheel", self._readings, tuple(reading))
+            self._advance(self._state, math.inf, live=True)
+            self._absorb(before)
+        return kept
+
     def feed_fix(self, row: Array) -> int:
         """See `Timeline.feed_fix`."""
+        if not self._plausible(float(row[k.F_T])):
+            return k.TOO_LATE
         key = self._fix_key(row)
         place = bisect.bisect_left(self._fixes, key, key=self._fix_key)
         if place < len(self._fixes) and self._fix_key(self._fixes[place]) == key:
@@ -332,10 +389,10 @@ class ReferenceTimeline:
 
     def pose_at(self, t: float, channel: Channel = "best") -> Array | None:
         """See `Timeline.pose_at`."""
-        fixes = self._fixes
+        fixes, readings = self._fixes, self._readings
         if t >= self._state.t:
             state = self._state.copy()
-            fixes = []
+            fixes, readings = [], []
         else:
             earlier = [checkpoint for checkpoint in self._checkpoints if checkpoint.t <= t]
             if not earlier:
@@ -344,15 +401,15 @@ class ReferenceTimeline:
         self._advance(state, t, live=False)
         if state.imu_cursor < len(self._samples) and t < self._state.t:
             self._head_for(state, self._samples[state.imu_cursor])
-            self._run_to(state, t, fixes)
+            if t > state.t:
+                self._run_to(state, t, fixes, readings)
         elif state.initialised or fixes:
             state.next_t, state.next_u = math.inf, state.u
             fresh = min(t, state.t_imu + self._params.imu_gap)
-            # Later than that nothing is known, and the pose stays where it was.
-            for bridging, leg in ((False, fresh), (True, min(t, max(fresh, state.t) + k.SPEED_TIME))):
+            for bridging, leg in ((False, fresh), (True, t)):
                 if leg > state.t:
                     state.bridging = bridging
-                    self._run_to(state, leg, fixes)
+                    self._run_to(state, leg, fixes, readings)
         if not state.initialised:
             return None
         out = self._pose(state)
@@ -388,22 +445,38 @@ class ReferenceTimeline:
                 return True
         return False
 
-    def _insert_sample(self, sample: tuple[float, ...]) -> bool:
-        t = sample[0]
-        place = len(self._samples)
-        if place and t <= self._samples[-1][0]:
-            place = bisect.bisect_right(self._samples, (t, math.inf))
+    def _plausible(self, t: float) -> bool:
+        """Whether a stamp may be true: one of the far future is not, two are a pause."""
+        near = t <= self._horizon + k.FAR_AHEAD or math.isinf(self._horizon)
+        if near or abs(t - self._ahead) <= self._params.buffer:
+            return True
+        self._ahead = t
+        return False
+
+    def _insert(self, kind: str, readings: list[tuple[float, ...]], reading: tuple[float, ...]) -> bool:
+        """Put a reading of the IMU ("imu"), or of the wheels ("wheel"), in its place."""
+        t = reading[0]
+        if not self._plausible(t):
+            self._figures[f"{kind}_late"] += 1
+            return False
+        place = len(readings)
+        if place and t <= readings[-1][0]:
+            place = bisect.bisect_right(readings, t, key=lambda other: other[0])
         replaces = False
-        if place and self._samples[place - 1][0] == t:
-            self._figures["imu_duplicates"] += 1
-            replaces = sample < self._samples[place - 1]
+        if place and readings[place - 1][0] == t:
+            self._figures[f"{kind}_duplicates"] += 1
+            replaces = _order(reading) < _order(readings[place - 1])
             if not replaces:
                 return False
-        in_order = place == len(self._samples) and not replaces and self._precedes_sample(self._state, t)
-        if not in_order and not self._rewind(t, lambda state: self._precedes_sample(state, t)):
-            self._figures["imu_late"] += 1
+
+        def precedes(state: _State) -> bool:
+            return self._precedes_sample(state, t) if kind == "imu" else state.t < t
+
+        in_order = place == len(readings) and not replaces and precedes(self._state)
+        if not in_order and not self._rewind(t, precedes):
+            self._figures[f"{kind}_late"] += 1
             return False
-        self._samples[place - replaces : place] = [sample]
+        readings[place - replaces : place] = [reading]
         self._horizon = max(self._horizon, t)
         return True
 
@@ -412,19 +485,54 @@ class ReferenceTimeline:
         oldest = self._horizon - 1.5 * self._params.buffer
         keep = max(0, bisect.bisect_left(self._checkpoints, oldest, key=lambda state: state.t) - 1)
         first = self._checkpoints[keep]
-        samples, fixes = first.imu_cursor, first.fix_cursor
-        if samples < 1000 and fixes < 100:
+        samples, fixes, readings = first.imu_cursor, first.fix_cursor, first.wheel_cursor
+        if samples < 1000 and fixes < 100 and readings < 1000:
             return  # seldom, and then much
         del self._checkpoints[:keep]
         del self._samples[:samples]
         del self._fixes[:fixes]
+        del self._readings[:readings]
         for state in (self._state, *self._checkpoints):
             state.imu_cursor -= samples
             state.fix_cursor -= fixes
+            state.wheel_cursor -= readings
 
     def _head_for(self, state: _State, sample: tuple[float, ...]) -> None:
+        """See `kernels._next_sample`."""
         state.next_t, state.next_u = sample[0], np.array(sample[1:])
-        state.bridging = sample[0] - state.t_imu > self._params.imu_gap
+        change = (state.next_u - state.u).reshape(2, 3)
+        squared = (change * change).sum(axis=1).tolist()
+        state.clipped = list(state.clipped)
+        saturated = False
+        for i, least in enumerate((k.SATURATED_GYRO, k.SATURATED_ACCEL)):
+            for axis in range(3):
+                if change[i, axis] == 0.0 and abs(state.u[3 * i + axis]) >= max(state.largest[i], least):
+                    state.clipped[i] += 1
+                    saturated |= state.clipped[i] >= k.CLIPPED_OFTEN
+        state.same_run = 0 if change.any() else state.same_run + 1
+        state.bridging = sample[0] - state.t_imu > self._params.imu_gap or state.same_run >= k.STUCK_AFTER
+        known = state.largest[1] > 0.0
+        # of both sensors: what one sample alone may change by, and what none can
+        limits = zip(
+            squared, state.change, (k.SPIKE_GYRO, k.SPIKE_ACCEL), (k.IMPOSSIBLE_GYRO, k.IMPOSSIBLE_ACCEL), strict=True
+        )
+        spike = impossible = False
+        for square, usual, least, most in limits:
+            spike |= square > max(k.SPIKE**2 * usual, least**2)
+            impossible |= square > most**2
+        if impossible or (spike and not state.suspect and known):
+            state.suspect = True
+            state.next_u = state.u
+        else:
+            state.suspect = False
+            if known:
+                state.change = [c + 0.02 * (square - c) for c, square in zip(state.change, squared, strict=True)]
+            largest = np.abs(state.next_u).reshape(2, 3).max(axis=1).tolist()
+            state.clipped = [
+                0 if new > old else c for new, old, c in zip(largest, state.largest, state.clipped, strict=True)
+            ]
+            state.largest = [max(new, old) for new, old in zip(largest, state.largest, strict=True)]
+        state.blind = saturated or state.suspect
 
     def _advance(self, state: _State, until: float, live: bool) -> None:
         while True:
@@ -433,71 +541,105 @@ class ReferenceTimeline:
                 sample = self._samples[state.imu_cursor]
                 self._head_for(state, sample)
                 t = sample[0]
-            elif live and state.fix_cursor < len(self._fixes) and self._horizon > state.t_imu + self._params.imu_gap:
-                t = float(self._fixes[state.fix_cursor][k.F_T]) + state.td_applied
+            elif live and self._horizon > state.t_imu + self._params.imu_gap:
+                waiting = [reading[0] for reading in self._readings[state.wheel_cursor :][:1]]
+                waiting += [float(fix[k.F_T]) + state.td_applied for fix in self._fixes[state.fix_cursor :][:1]]
+                if not waiting:
+                    return
+                t = min(waiting)
                 state.next_t, state.bridging = math.inf, True
             else:
                 return
-            self._run_to(state, t, self._fixes)
+            self._run_to(state, t, self._fixes, self._readings)
             state.trailing = sample is None
             if sample is not None:
-                if state.initialised:
-                    grid = math.floor(t * k.GRID_HZ)
-                    if math.isinf(state.t_imu) or grid != math.floor(state.t_imu * k.GRID_HZ):
-                        self._watch(state)
-                        for f in state.filters:
-                            self._constrain(state, f)
-                else:
+                if not state.initialised:
                     state.accel_count = min(state.accel_count + 1, 100)
                     step = (np.array(sample[4:]) - state.accel_mean) / state.accel_count
                     state.accel_mean = state.accel_mean + step
+                elif math.floor(t * k.GRID_HZ) != state.grid_at:
+                    self._watch(state)
                 state.t_imu = t
+                self._grid(state)
                 state.imu_cursor += 1
             if live and state.t - self._checkpoints[-1].t >= self._params.buffer / k.CP_PER_BUFFER:
                 self._checkpoints.append(state.copy())
                 if len(self._checkpoints) > 4 * k.CP_PER_BUFFER:
                     self._forget()
 
-    def _run_to(self, state: _State, t_end: float, fixes: list[Array]) -> None:
-        p = self._params
+    def _grid(self, state: _State) -> None:
+        """The pseudo-measurements, where t has come to the next step of their grid."""
+        step = math.floor(state.t * k.GRID_HZ)
+        if step != state.grid_at:
+            state.grid_at = step
+            for f in state.filters if state.initialised else []:
+                self._constrain(state, f)
+
+    def _run_to(self, state: _State, t_end: float, fixes: list[Array], readings: list[tuple[float, ...]]) -> None:
         while True:
-            t, fix = t_end, None
+            t, fix, reading = t_end, None, None
             if state.fix_cursor < len(fixes) and fixes[state.fix_cursor][k.F_T] + state.td_applied <= t_end:
                 fix = fixes[state.fix_cursor]
                 t = float(fix[k.F_T]) + state.td_applied
+            if state.wheel_cursor < len(readings) and readings[state.wheel_cursor][0] <= t:
+                reading = readings[state.wheel_cursor]
+                t = reading[0]
             dt = t - state.t
+            if state.bridging:
+                dt = min(dt, k.MOST_BRIDGED)
             if dt > 0.0:
                 part = 1.0
                 if t < state.next_t and math.isfinite(state.t):
                     part = dt / (state.next_t - state.t)
                 ahead = state.next_u if part == 1.0 else state.u + part * (state.next_u - state.u)
-                mean = 0.5 * (state.u + ahead)
                 for f in state.filters if state.initialised else []:
-                    if state.bridging:
-                        force = GRAVITY * f.rotation.T @ f.up
-                        noise = (p.no_imu_rate_noise, p.no_imu_accel_noise, p.gyro_bias_walk, p.accel_bias_walk)
-                        f.move(f.bias + np.concatenate([np.zeros(3), force]), dt, noise)
-                    else:
-                        white = (p.gyro_noise * state.scale[1], p.accel_noise * state.scale[0])
-                        noise = (*white, p.gyro_bias_walk, p.accel_bias_walk)
-                        f.move(mean, dt, noise)
+                    self._move(state, f, 0.5 * (state.u + ahead), t, dt)
                 state.u = ahead
                 state.t = t
-            if fix is None:
-                return
-            if state.initialised:
-                self._judge(state, fix)
+            if reading is not None:
+                for f in state.filters if state.initialised else []:
+                    self._odometry(state, f, reading)
+                state.wheel_cursor += 1
+            elif fix is not None:
+                if state.initialised:
+                    self._judge(state, fix)
+                else:
+                    self._initialise(state, fix)
+                    fix[k.F_OUTCOME] = k.INIT
+                state.td_applied = state.main.time_offset
+                state.fix_cursor += 1
             else:
-                self._initialise(state, fix)
-                fix[k.F_OUTCOME] = k.INIT
-            state.td_applied = state.main.time_offset
-            state.fix_cursor += 1
+                return
+            if state.bridging:
+                self._grid(state)
+
+    def _move(self, state: _State, f: ErrorStateFilter, u: Array, t: float, dt: float) -> None:
+        """Carry a filter on to t, by the IMU's u (6,), or by itself while there is none."""
+        p = self._params
+        walks = (p.gyro_bias_walk, p.accel_bias_walk)
+        if state.bridging:
+            # straight on, unless the wheels say how it turns
+            turns = t - state.t_wheel <= p.imu_gap
+            rate = [0.0, 0.0, state.wheel_rate if turns else 0.0]
+            rate_noise = p.wheel_rate_sigma / math.sqrt(k.GRID_HZ) if turns else p.no_imu_rate_noise
+            force = GRAVITY * f.rotation.T @ f.up
+            f.move(f.bias + np.concatenate([rate, force]), dt, (rate_noise, 0.0, *walks))
+            f.slow(dt, p.no_imu_accel_noise)
+            return
+        shaken = math.sqrt(state.change[1] / 6.0 * min(state.next_t - state.t_imu, p.imu_gap))
+        white = (p.gyro_noise * state.scale[1], max(p.accel_noise * state.scale[0], shaken - 2.0 * p.accel_noise))
+        if state.blind:
+            white = (state.largest[0] * k.BLIND_TIME, state.largest[1] * k.BLIND_TIME)
+        f.move(u, dt, (*white, *walks))
 
     # --- measurements
 
     @staticmethod
     def _hypothesis(fix: Array, i: int) -> Array:
         return fix[k.F_HYPOTHESES + i * k.HYPOTHESIS : k.F_HYPOTHESES + (i + 1) * k.HYPOTHESIS]
+
+    def _chosen(self, fix: Array) -> Array:
+        return self._hypothesis(fix, int(fix[k.F_CHOSEN]))
 
     def _initialise(self, state: _State, fix: Array) -> None:
         p = self._params
@@ -514,6 +656,7 @@ class ReferenceTimeline:
                 hypothesis[k.H_COV + 7 * i] += k.UNKNOWN_TILT_SIGMA**2
         f.P = self._prior()
         f.start(hypothesis, p.velocity_sigma)
+        state.systematic = hypothesis[k.H_SYSTEMATIC :]
         state.initialised = True
         state.accepted_count = 1
         state.t_accepted = state.t
@@ -530,7 +673,7 @@ class ReferenceTimeline:
     def _prior(self) -> Array:
         p = self._params
         sigmas = [0.0] * 9 + [p.gyro_bias_sigma] * 3 + [p.accel_bias_sigma] * 3 + [p.time_offset_sigma]
-        return np.diag(np.square([*sigmas, p.tilt_sigma, p.tilt_sigma]))
+        return np.diag(np.square([*sigmas, *[p.tilt_sigma] * 2, *[p.wheel_scale_sigma] * 2]))
 
     def _weigh(self, state: _State, f: ErrorStateFilter, fix: Array) -> tuple[Array, Array, Array, Array]:
         """Choose the hypothesis, write the fix's figures. -> H, y, R, S."""
@@ -586,10 +729,25 @@ class ReferenceTimeline:
                 factor = math.exp(max(state.excess[i] - k.IGNORED_EXCESS, 0.0))
                 state.scale[i] = math.sqrt(factor) if i < 2 else factor
 
+    def _restarted(self, state: _State, fix: Array, count: int) -> None:
+        """See `kernels._restarted`."""
+        state.shadow, state.shadow_count, state.rejected_run = None, 0, 0
+        state.accepted_count = count
+        state.reset_id += 1
+        state.t_accepted = state.t
+        state.main.reopen(DTD, self._params.time_offset_sigma**2)
+        state.systematic = self._chosen(fix)[k.H_SYSTEMATIC :]
+        fix[k.F_OUTCOME] = k.REINIT
+
     def _judge(self, state: _State, fix: Array) -> None:
         p = self._params
         main = state.main
         H, y, R, S = self._weigh(state, main, fix)
+        if main.P.diagonal()[TH].max() > 2.0 * k.UNKNOWN_HEADING**2:
+            # after so long without an IMU nothing is left to weigh the fix by
+            main.start(self._chosen(fix), p.velocity_sigma)
+            self._restarted(state, fix, 1)
+            return
         ratio = self._gate_ratio(fix)
         figures = fix[k.F_D2 : k.F_REPORTED].copy()
         if state.still_since < state.t:
@@ -611,8 +769,21 @@ class ReferenceTimeline:
             state.shadow, state.shadow_count, state.rejected_run = None, 0, 0
             state.accepted_count += 1
             state.t_accepted = state.t
+            state.systematic = self._chosen(fix)[k.H_SYSTEMATIC :]
+            state.place_count = n = min(state.place_count + 1, int(k.PLACE_FIXES))
+            off = main.position - state.place
+            state.place = state.place + off / n
+            state.place2 = state.place2 + (off * off * (n - 1) / n - state.place2) / n
             return
+        partly = bool(fix[k.F_D2_POSITION] <= p.gate_block)
         fix[k.F_OUTCOME] = k.REJECTED
+        if partly:
+            # turned, or flipped, it is still where it is
+            fix[k.F_OUTCOME] = k.INFLATED
+            alone = k.UNKNOWN_HEADING**2 * np.eye(6)
+            alone[:3, :3] = R[:3, :3]
+            main.correct(H, y, alone)
+            state.t_accepted = state.t
         if state.shadow is None:
             state.rejected_since = state.t
         patient = state.t - state.rejected_since >= p.reinit_patience
@@ -642,16 +813,12 @@ class ReferenceTimeline:
             if not known:
                 state.shadow = ErrorStateFilter()
                 state.shadow.P = self._prior()
-            state.shadow.start(self._hypothesis(fix, int(fix[k.F_CHOSEN])), p.velocity_sigma)
+            state.shadow.start(self._chosen(fix), p.velocity_sigma)
             state.shadow_count = 1
-            take = patient or (state.rejected_run >= 2 * p.reinit_count and not turned)
+            take = patient or (state.rejected_run >= 2 * p.reinit_count and not (turned and partly))
         if take:
-            state.rejected_run = 0
-            state.main, state.shadow = state.shadow, None
-            state.accepted_count, state.shadow_count = state.shadow_count, 0
-            state.reset_id += 1
-            state.t_accepted = state.t
-            fix[k.F_OUTCOME] = k.REINIT
+            state.main = state.shadow
+            self._restarted(state, fix, state.shadow_count)
 
     def _gate_ratio(self, fix: Array) -> float:
         p = self._params
@@ -669,15 +836,22 @@ class ReferenceTimeline:
         """Is the robot at rest? See `kernels._watch`."""
         p = self._params
         t = state.t
-        first = bisect.bisect_left(self._samples, (t - k.STILL_WINDOW,))
+        first = bisect.bisect_left(self._samples, -k.STILL_WINDOW, key=lambda sample: sample[0] - t)
         window = np.array(self._samples[first : state.imu_cursor + 1])[:, 1:]
+        n = len(window)
         still = False
-        if first > 0 and len(window) >= 4:
-            mean = window.sum(axis=0) / len(window)
-            off = window - mean
-            variances = (np.einsum("ij,ij->j", off, off) / (len(window) - 1)).tolist()
+        if first > 0 and n >= 4:
+            # around the newest, so that a sensor that is stuck scatters by nothing at all
+            off = window - window[-1]
+            mean = off.sum(axis=0) / n
+            off = off - mean
+            variances = (np.einsum("ij,ij->j", off, off) / (n - 1)).tolist()
             scatter = [sum(variances[:3]), sum(variances[3:])]
-            state.still_mean = mean[:3]
+            state.still_mean, force = np.split(window[-1] + mean, 2)
+            if math.isinf(state.still_since):
+                state.still_force = force
+            pushed = math.dist(force, state.still_force)
+            state.still_force = state.still_force + 0.05 * (force - state.still_force)
             rate = math.dist(state.still_mean, state.main.gyro_bias)
             state.rest = [min(r * 1.001, s) if r > 0.0 else s for r, s in zip(state.rest, scatter, strict=True)]
             speed2 = float(state.main.velocity.dot(state.main.velocity))
@@ -692,6 +866,7 @@ class ReferenceTimeline:
             still = (
                 scatter[0] <= 9.0 * state.rest[0] + 1e-6
                 and scatter[1] <= 9.0 * state.rest[1] + 1e-4
+                and pushed < k.STILL_PUSH + 4.0 * math.sqrt(scatter[1] / n)
                 and t > state.still_barred
                 and rate < p.still_rate + unsure
                 and speed2 < p.still_speed**2
@@ -707,10 +882,16 @@ class ReferenceTimeline:
         p = self._params
         ground, wheels = self._motion != "free", self._motion == "differential"
         factor = 1.0 if state.still_sure else 3.0
-        still = state.still_since <= state.t - k.STILL_AFTER * (1.0 if state.still_sure else 2.0)
+        still = state.t - state.t_imu <= p.imu_gap and state.still_since <= state.t - k.STILL_AFTER * (
+            1.0 if state.still_sure else 2.0
+        )
+        if p.time_offset_sigma > 0.0:
+            f.P = f.P + k.TIME_OFFSET_WALK**2 / k.GRID_HZ * np.outer(_I[DTD], _I[DTD])
+        # how much looser or tighter each constraint is than it was meant; not tighter for roll and pitch
+        loose = [max(n, 1.0 if i in (1, 2) else k.LEAST_CONSTRAINT) for i, n in enumerate(state.constraint_nis)]
 
         def loosened(sigma: float, i: int, y: float) -> float:
-            return max(sigma**2 * max(float(state.constraint_nis[i]), 1.0), float(y * y))
+            return max(sigma**2 * loose[i], float(y * y))
 
         body = f.rotation.T.dot(f.velocity)
         usual = max(state.usual_speed2, k.LEAST_SPEED**2) * 2.0 * k.SPEED_TIME * k.GRID_HZ
@@ -720,12 +901,16 @@ class ReferenceTimeline:
         # a speed that is known a thousand times better learns nothing from what is usual
         known = np.diag(f.P)[DV] < 1e-3 * usual
         axes = [i for i in range(3) if still or (wheels and i == 1) or not known[i]]
-        H = np.zeros((len(axes) + 6, N))
+        H = np.zeros((12, N))
         H[: len(axes), DV], H[: len(axes), TH] = _I3[axes], skew(body)[axes]
         y = (-body[axes]).tolist()
         variances = [variances[i] for i in axes]
+        if state.t - state.t_accepted > k.COAST_TIME and state.place_count > 10:
+            H[len(y) : len(y) + 3, DP] = f.rotation
+            y += (state.place - f.position).tolist()
+            variances += (np.maximum(state.place2, k.LEAST_PLACE**2) * 2.0 * k.PLACE_TIME * k.GRID_HZ).tolist()
         if still:
-            H[3:6, DBG] = _I3
+            H[len(y) : len(y) + 3, DBG] = _I3
             y += (state.still_mean - f.gyro_bias).tolist()
             variances += [(2.0 * p.gyro_noise) ** 2 * k.GRID_HZ] * 3
         if ground:
@@ -741,10 +926,41 @@ class ReferenceTimeline:
             state.constraint_nis = state.constraint_nis.copy()
             for i, row in enumerate([m - 3, m - 2, m - 1, axes.index(1)] if wheels else [m - 3, m - 2, m - 1]):
                 expected = variances[row] + H[row] @ f.P @ H[row]
-                now = min(y[row] ** 2 / expected, 9.0) * max(state.constraint_nis[i], 1.0)
+                now = min(y[row] ** 2 / expected, 9.0) * loose[i]
                 state.constraint_nis[i] += 0.05 * (now - state.constraint_nis[i])
         if m:
-            f.correct(H[:m], np.array(y), np.array(variances) * _I[:m, :m])
+            f.correct(H[:m], np.array(y), np.diag(variances))
+
+    def _odometry(self, state: _State, f: ErrorStateFilter, reading: tuple[float, ...]) -> None:
+        """A reading of the wheels, see `kernels._odometry`. The main filter comes first, and does the bookkeeping."""
+        p = self._params
+        if f is state.main:
+            since, state.t_wheel = state.t - state.t_wheel, state.t
+            state.wheel_share = max(1.0 / (k.GRID_HZ * max(since, 1e-3)), 1.0)
+            state.wheel_rate = 0.0 if math.isnan(reading[2]) else reading[2] / (1.0 + float(f.wheel_scale[1]))
+        body = f.rotation.T @ f.velocity
+        H = np.zeros((2, N))
+        H[0, DV], H[0, TH] = _I3[0], skew(body)[0]
+        H[1, DBG] = -_I3[2]
+        H *= (1.0 + f.wheel_scale)[:, np.newaxis]
+        values = np.array([body[0], state.u[2] - f.gyro_bias[2]])
+        H[:, DWHEEL] = np.diag(values)
+        y = np.array(reading[1:]) - (1.0 + f.wheel_scale) * values
+        rows, variances = [], []
+        for i, sigma in enumerate((p.wheel_speed_sigma, p.wheel_rate_sigma)):
+            if math.isnan(y[i]) or (i == 1 and state.bridging):
+                continue
+            loose = max(state.wheel_nis[i], 1.0)
+            variance = max(sigma**2 * state.wheel_share * loose, float(y[i] ** 2))
+            rows.append(i)
+            variances.append(variance)
+            if f is state.main:
+                now = min(y[i] ** 2 / (variance + H[i] @ f.P @ H[i]), 9.0) * loose
+                nis = list(state.wheel_nis)
+                nis[i] += 0.05 / state.wheel_share * (now - nis[i])
+                state.wheel_nis = nis
+        if rows:
+            f.correct(H[rows], y[rows], np.diag(variances))
 
     def _pose(self, state: _State) -> Array:
         f = state.main
@@ -756,7 +972,7 @@ class ReferenceTimeline:
         out[k.P_RATE : k.P_RATE + 3] = 0.0 if state.bridging else state.u[:3] - f.gyro_bias
         turn = np.kron(np.eye(2), f.rotation)
         order = np.r_[6:9, 0:3]
-        out[k.P_COV : k.P_COV + 36] = (turn @ f.P[np.ix_(order, order)] @ turn.T).ravel()
+        out[k.P_COV : k.P_COV + 36] = (turn @ f.P[np.ix_(order, order)] @ turn.T).ravel() + state.systematic
         out[k.P_VCOV : k.P_VCOV + 9] = (f.rotation @ f.P[DV, DV] @ f.rotation.T).ravel()
         out[k.P_T_ACCEPTED], out[k.P_RESET_ID], out[k.P_T_IMU] = state.t_accepted, state.reset_id, state.t_imu
         return out
