@@ -310,6 +310,7 @@ class ReferenceTimeline:
             kept += self._insert("imu", self._samples, tuple(sample))
             self._advance(self._state, math.inf, live=True)
             self._absorb(before)
+            self._forget()
             if track is not None:
                 state, row = self._state, track[i]
                 row[0] = state.t
@@ -331,6 +332,7 @@ class ReferenceTimeline:
             kept += self._insert("wheel", self._readings, tuple(reading))
             self._advance(self._state, math.inf, live=True)
             self._absorb(before)
+            self._forget()
         return kept
 
     def feed_fix(self, row: Array) -> int:
@@ -481,13 +483,13 @@ class ReferenceTimeline:
         return True
 
     def _forget(self) -> None:
-        """Drop what lies too far back for any input to be put before it."""
+        """Drop what lies too far back for any input to be put before it. Seldom, and then much."""
+        if len(self._checkpoints) <= 4 * k.CP_PER_BUFFER:
+            return
         oldest = self._horizon - 1.5 * self._params.buffer
         keep = max(0, bisect.bisect_left(self._checkpoints, oldest, key=lambda state: state.t) - 1)
         first = self._checkpoints[keep]
         samples, fixes, readings = first.imu_cursor, first.fix_cursor, first.wheel_cursor
-        if samples < 1000 and fixes < 100 and readings < 1000:
-            return  # seldom, and then much
         del self._checkpoints[:keep]
         del self._samples[:samples]
         del self._fixes[:fixes]
@@ -564,8 +566,6 @@ class ReferenceTimeline:
                 state.imu_cursor += 1
             if live and state.t - self._checkpoints[-1].t >= self._params.buffer / k.CP_PER_BUFFER:
                 self._checkpoints.append(state.copy())
-                if len(self._checkpoints) > 4 * k.CP_PER_BUFFER:
-                    self._forget()
 
     def _grid(self, state: _State) -> None:
         """The pseudo-measurements, where t has come to the next step of their grid."""
