@@ -7,7 +7,7 @@ import pytest
 
 from fusion import kernels as k
 from fusion.geometry import exp_so3, log_so3, quaternion_from_rotation, rotation_from_quaternion
-from fusion.params import FilterParams
+from fusion.params import GRAVITY, FilterParams
 from fusion.timeline import parameter_vector
 
 INPUT = np.array([0.7, -0.4, 1.1, 0.8, -1.2, 9.4])
@@ -23,7 +23,8 @@ def some_state(rng):
     s[k.BA : k.BA + 3] = rng.normal(0.0, 0.2, 3)
     s[k.TD] = 0.01
     s[k.TILT : k.TILT + 2] = rng.normal(0.0, 0.02, 2)
-    s[k.SCALE : k.SCALE + 4] = 1.0
+    s[k.WHEEL : k.WHEEL + 2] = [0.03, -0.05]
+    s[k.SCALE : k.SCALE + 4] = s[k.CONSTRAINT_NIS : k.CONSTRAINT_NIS + 4] = 1.0
     return s
 
 
@@ -190,11 +191,106 @@ def test_constraint_jacobian_equals_central_differences(motion, still):
         sigmas = [prm[k.GROUND_VELOCITY_SIGMA], *[prm[k.GROUND_TILT_SIGMA]] * 2]
         variances += [max(sigma**2, value**2) for sigma, value in zip(sigmas, y[-3:], strict=True)]
     P = some_covariance(rng)
+    s[k.COV : k.COV + k.N * k.N] = P.ravel()
+    P[k.DTD, k.DTD] += k.TIME_OFFSET_WALK**2 / k.GRID_HZ
     S = H @ P @ H.T + np.diag(variances)
     expected = moved(s, P @ H.T @ np.linalg.solve(S, y))
-    s[k.COV : k.COV + k.N * k.N] = P.ravel()
     k._constrain(s, prm)
-    np.testing.assert_allclose(s[: k.COV - 1], expected[: k.COV - 1], atol=1e-6)
+    np.testing.assert_allclose(s[: k.COV], expected[: k.COV], atol=1e-8)
+
+
+@pytest.mark.parametrize("bridging", [False, True])
+@pytest.mark.parametrize("told", [(True, True), (True, False), (False, True)])
+def test_odometry_jacobian_equals_central_differences(told, bridging):
+    """Speed and yaw rate, against an update with what differences make of their definition."""
+    rng = np.random.default_rng(7)
+    s = some_state(rng)
+    s[k.U : k.U + 6] = INPUT
+    s[k.T], s[k.T_WHEEL], s[k.BRIDGING] = 3.0, 2.98, bridging
+    prm = parameter_vector(FilterParams(), "free")
+
+    def prediction(state):
+        R = rotation_from_quaternion(state[k.Q : k.Q + 4])
+        scale = 1.0 + state[k.WHEEL : k.WHEEL + 2]
+        return scale * [(R.T @ state[k.V : k.V + 3])[0], INPUT[2] - state[k.BG + 2]]
+
+    h = 1e-6
+    H = np.empty((2, k.N))
+    for i in range(k.N):
+        dx = np.zeros(k.N)
+        dx[i] = h
+        H[:, i] = (prediction(moved(s, dx)) - prediction(moved(s, -dx))) / (2.0 * h)
+    y = np.array([0.02, -0.03])
+    reading = np.array([3.0, *np.where(told, prediction(s) + y, np.nan)])
+    # 50 a second tell no more than ten
+    variances = 5.0 * np.square([prm[k.WHEEL_SPEED_SIGMA], prm[k.WHEEL_RATE_SIGMA]])
+    rows = [i for i in range(2) if told[i] and not (i == 1 and bridging)]
+    P = some_covariance(rng)
+    s[k.COV : k.COV + k.N * k.N] = P.ravel()
+    H, y = H[rows], y[rows]
+    S = H @ P @ H.T + np.diag(variances[rows])
+    expected = moved(s, P @ H.T @ np.linalg.solve(S, y))
+    k._odometry(s, prm, reading)
+    np.testing.assert_allclose(s[: k.COV], expected[: k.COV], atol=1e-8)
+    assert s[k.T_WHEEL] == 3.0
+    assert s[k.WHEEL_RATE] == pytest.approx(reading[2] / 0.95 if told[1] else 0.0)
+
+
+def test_a_reading_that_is_far_off_is_loosened_until_it_is_one_sigma():
+    s = some_state(np.random.default_rng(8))
+    s[k.T], s[k.T_WHEEL] = 3.0, 2.9
+    s[k.COV : k.COV + k.N * k.N] = (1e-4 * np.eye(k.N)).ravel()
+    speed = (rotation_from_quaternion(s[k.Q : k.Q + 4]).T @ s[k.V : k.V + 3])[0]
+    before = s.copy()
+    k._odometry(s, parameter_vector(FilterParams(), "free"), np.array([3.0, 1.03 * speed + 5.0, np.nan]))
+    gained = np.linalg.norm(s[k.V : k.V + 3] - before[k.V : k.V + 3])
+    assert gained == pytest.approx(5.0 * 1.03 * 1e-4 / 25.0, rel=1e-3)
+
+
+def slowed(s, dt, noise, steps=1):
+    """Bridged as the timeline does it: straight on, then what has been left out."""
+    out = s.copy()
+    for _ in range(steps):
+        R = rotation_from_quaternion(out[k.Q : k.Q + 4])
+        up = np.array([*out[k.TILT : k.TILT + 2], np.sqrt(1.0 - np.sum(out[k.TILT : k.TILT + 2] ** 2))])
+        gyro, accel = out[k.BG : k.BG + 3], out[k.BA : k.BA + 3] + GRAVITY * R.T @ up
+        k.predict(out[: k.BLOCK], *gyro, *accel, dt / steps, 0.0, 0.0, 0.0, 0.0)
+        k._slow(out[: k.BLOCK], dt / steps, noise)
+    return out
+
+
+def test_a_speed_decays_the_same_in_one_step_or_many():
+    s = some_state(np.random.default_rng(9))
+    # A covariance without what the attitude and biases would add, which predict knows of a step at a time.
+    P = np.zeros((k.N, k.N))
+    A = np.random.default_rng(10).normal(0.0, 0.1, (6, 6))
+    P[3:9, 3:9] = A @ A.T
+    s[k.COV : k.COV + k.N * k.N] = P.ravel()
+    once, often = slowed(s, 1.7, 0.8), slowed(s, 1.7, 0.8, 500)
+    np.testing.assert_allclose(once[: k.COV], often[: k.COV], atol=1e-10)
+    P, Q = (state[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)[3:9, 3:9] for state in (once, often))
+    np.testing.assert_allclose(P, Q, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(once[k.V : k.V + 3], s[k.V : k.V + 3] * np.exp(-1.7 / k.COAST_TIME), rtol=1e-12)
+
+
+def test_a_bridged_speed_scatters_as_the_process_simulated_step_by_step():
+    """v' = -v/τ + w by brute force, 20 000 robots in steps of 1 ms."""
+    noise, dt, steps = 0.8, 0.001, 1500
+    rng = np.random.default_rng(11)
+    position, velocity = np.zeros(20_000), np.full(20_000, 0.9)
+    for _ in range(steps):
+        position += 0.5 * dt * velocity
+        velocity += -velocity / k.COAST_TIME * dt + rng.normal(0.0, noise * np.sqrt(dt), len(velocity))
+        position += 0.5 * dt * velocity
+    s = np.zeros(k.STATE)
+    s[k.Q], s[k.V] = 1.0, 0.9
+    s = slowed(s, steps * dt, noise)
+    P = s[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
+    simulated = np.cov(velocity, position)
+    # a variance of 20 000 is known to 1 % (1 sigma)
+    np.testing.assert_allclose(P[np.ix_([k.DV, k.DP], [k.DV, k.DP])], simulated, rtol=0.04)
+    assert s[k.POS] == pytest.approx(position.mean(), abs=0.02)
+    assert s[k.V] == pytest.approx(velocity.mean(), abs=0.02)
 
 
 def test_update_is_the_textbook_one_and_keeps_a_covariance():
