@@ -1464,8 +1464,9 @@ def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
         # The same stamp twice: one is kept, and which one must not depend on the order of arrival.
         meta[IMU_DUPLICATES if imu else WHEEL_DUPLICATES] += 1.0
         for i in range(1, width):
-            if reading[i] != ring[(place - 1) & mask, i]:
-                replaces = reading[i] < ring[(place - 1) & mask, i]
+            a, b = reading[i], ring[(place - 1) & mask, i]
+            if a != b and not (math.isnan(a) and math.isnan(b)):
+                replaces = a < b or math.isnan(b)
                 break
         if not replaces:
             return False

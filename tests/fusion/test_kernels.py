@@ -11,7 +11,6 @@ from fusion.params import GRAVITY, FilterParams
 from fusion.timeline import parameter_vector
 
 INPUT = np.array([0.7, -0.4, 1.1, 0.8, -1.2, 9.4])
-ERROR = [(k.TH, 3), (k.DV, 3), (k.DP, 3), (k.DBG, 3), (k.DBA, 3), (k.DTD, 1), (k.DTILT, 2), (k.DWHEEL, 2)]
 
 
 def some_state(rng):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fusion import kernels as k
 from fusion.localiser import Localiser
-from fusion.measurements import ImuBatch, Outcome
+from fusion.measurements import ImuBatch, Outcome, WheelOdometry
 from fusion.params import FilterParams
+from fusion.simulator import CameraParams, ImuParams, WheelParams, random_ground, simulate
 from tests.fusion import circle
 
 PARAMS = FilterParams(time_offset_sigma=0.05, tilt_sigma=0.03)
@@ -48,6 +50,84 @@ def test_any_order_of_arrival_gives_the_same_bits(seed, motion):
         order = rng.permutation(len(measurements))
         state, _ = final_state([measurements[i] for i in order], motion)
         np.testing.assert_array_equal(state, expected)
+
+
+def troubled(seed):
+    """Inputs of 1.9 s one by one: an IMU that is stuck, has a spike, a pause and ends early; wheels all the while."""
+    rng = np.random.default_rng(seed)
+    samples = circle.imu(np.arange(0.0, 1.5, 0.02), rng)
+    samples[15:28, 1:] = samples[15, 1:]
+    samples[35, 4:] += 80.0
+    samples = samples[(samples[:, 0] < 0.9) | (samples[:, 0] > 1.2)]
+    readings = np.column_stack([np.arange(0.01, 1.9, 0.05), *rng.normal([[0.5], [0.4]], 0.01, (2, 38))])
+    readings[7, 1], readings[11, 2] = np.nan, np.nan
+    batches = [ImuBatch("rover", 0.0, row[np.newaxis]) for row in samples]
+    wheels = [WheelOdometry("rover", 0.0, row[np.newaxis]) for row in readings]
+    fixes = [circle.fix(at, rng=rng, turned=0.8 * (i == 9)) for i, at in enumerate(np.arange(0.055, 1.85, 0.12))]
+    return [*batches, *wheels, *fixes], rng
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("motion", ["free", "ground", "differential"])
+def test_any_order_gives_the_same_bits_when_the_imu_fails_and_wheels_go_on(seed, motion):
+    measurements, rng = troubled(seed)
+    expected, localiser = final_state(measurements, motion)
+    assert localiser.counts["inflated"] >= 1
+    assert localiser._timeline.state[k.T] > localiser._timeline.state[k.T_IMU] + 0.3
+    for _ in range(5):
+        order = rng.permutation(len(measurements))
+        state, shuffled = final_state([measurements[i] for i in order], motion)
+        np.testing.assert_array_equal(state, expected)
+        assert shuffled.counts["imu_late"] == shuffled.counts["wheel_late"] == shuffled.counts["too_late"] == 0
+
+
+@pytest.mark.parametrize("first", [[1.0, 0.5, np.nan], [1.0, np.nan, 0.4], [1.0, 0.6, 0.4], [1.0, np.nan, 0.3]])
+@pytest.mark.parametrize("second", [[1.0, 0.5, 0.4], [1.0, 0.5, 0.3]])
+def test_wheels_that_tell_two_things_of_one_instant_are_heard_once(first, second):
+    states = []
+    for readings in ([first, second], [second, first]):
+        wheels = [WheelOdometry("rover", 0.0, np.array([reading])) for reading in readings]
+        state, localiser = final_state([circle.batch(np.arange(0.0, 1.5, 0.02)), circle.fix(0.5), *wheels])
+        assert localiser.counts["wheel_duplicates"] == 1
+        states.append(state)
+    np.testing.assert_array_equal(states[0], states[1])
+
+
+def test_a_replay_gives_the_poses_of_the_live_run_to_the_last_bit():
+    """Live: one by one, and poses asked for all the time. Replayed: in batches as long as nothing else comes."""
+    course = replace(random_ground(5), go=4.0, period=6.0)
+    wheels = WheelParams(rate=20.0, scale_sigma=0.05, slip_rate=0.5)
+    drive = simulate(course, 5, 20.0, ImuParams(rate=100.0), CameraParams(rate=3.0), wheels=wheels)
+    samples = drive.samples.copy()
+    samples[600:640, 1:] = samples[600, 1:]  # stuck
+    samples[800, 4:] += 80.0  # a spike
+    samples = np.delete(samples, slice(1000, 1250), axis=0)
+    arrivals = sorted(
+        [(row[0] + 0.002, ImuBatch("rover", 0.0, row[np.newaxis])) for row in samples]
+        + [(row[0] + 0.03, WheelOdometry("rover", 0.0, row[np.newaxis])) for row in drive.wheels]
+        + [(fix.arrival, fix) for fix in drive.fixes],
+        key=lambda pair: pair[0],
+    )
+    live, replayed = Localiser("rover", PARAMS, "differential"), Localiser("rover", PARAMS, "differential")
+    lived, rows = [], []
+    for arrival, measurement in arrivals:
+        row = np.empty((1, 8))
+        live.feed(measurement, row if isinstance(measurement, ImuBatch) else None)
+        live.pose_at(arrival + 0.05, "smooth")
+        live.pose_at(arrival - 0.4)
+        lived += [row] if isinstance(measurement, ImuBatch) else []
+    for kind, group in itertools.groupby((m for _, m in arrivals), type):
+        measurements = list(group)
+        if kind is ImuBatch:
+            chunk = np.concatenate([measurement.samples for measurement in measurements])
+            rows.append(np.empty((len(chunk), 8)))
+            replayed.feed(ImuBatch("rover", 0.0, chunk), rows[-1])
+        else:
+            for measurement in measurements:
+                replayed.feed(measurement)
+    np.testing.assert_array_equal(np.concatenate(lived), np.concatenate(rows))
+    assert live.counts == replayed.counts
+    assert live.counts["rejected"] + live.counts["inflated"] < live.counts["accepted"]
 
 
 def test_every_order_of_a_handful():
