@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 
-from fusion.measurements import Array, ImuBatch, Pose, PoseFix, PoseHypothesis
+from fusion.measurements import Array, ImuBatch, Pose, PoseFix, PoseHypothesis, WheelOdometry
 from server.app import Service
 from server.config import parse
 from server.messages import Dialect, Imu
@@ -89,6 +89,7 @@ class _Delays:
         self._waiting.setdefault(batch.robot, deque()).append(batch.arrival)
 
     def fix(self, fix: PoseFix) -> None: ...
+    def wheels(self, odometry: WheelOdometry) -> None: ...
     def track(self, robot: str, track: Array) -> None: ...
 
     def pose(self, pose: Pose) -> None:

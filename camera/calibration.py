@@ -309,7 +309,7 @@ def _solve(board: Board, views: Sequence[BoardView], start: _Solved | None = Non
             np.eye(3) if start is None else start.camera_matrix.copy(),
             np.zeros(5) if start is None else start.distortion.copy(),
             flags=0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS,
-            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100 if start is None else 10, 1e-12),
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30 if start is None else 10, 1e-12),
         )
     except cv2.error as error:
         raise CalibrationError(

@@ -266,7 +266,8 @@ class V4l2Device:
         if isinstance(source, str):
             _check_device(Path(source))
         with _stderr_silenced():
-            self._capture = cv2.VideoCapture(source, cv2.CAP_ANY)
+            # Of a path OpenCV would ask FFmpeg first, to which a device is a file like any other.
+            self._capture = cv2.VideoCapture(source, cv2.CAP_V4L2 if isinstance(source, str) else cv2.CAP_ANY)
         if not self._capture.isOpened():
             raise OSError(f"camera {source}: cannot be opened; is it in use by another program?")
         # The pixel format first: which sizes and rates there are depends on it. What came of size and rate is seen in

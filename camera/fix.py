@@ -41,6 +41,10 @@ class MarkerMount:
     body_from_marker: Array
 
 
+# m: sigma of a position that helps to find nothing.
+LOST = 1.0
+_NOWHERE = np.full((4, 2), -1e6)
+
 # A marker of a body with where it was seen.
 Seen = tuple[MarkerMount, MarkerSighting]
 
@@ -270,7 +274,8 @@ def predict(
     world_from_camera: Array,
     line_time: float = 0.0,
 ) -> dict[int, Prediction]:
-    """Where the markers of bodies with known poses, by name, should be seen; those in front of the camera only.
+    """Where the markers of bodies with known poses, by name, should be seen; those that cannot be, from behind or
+    behind the camera, far out of the picture. A pose that is not known to LOST is none.
 
     The poses are for the exposure of the image's first row. `line_time`: s from one row's exposure to the next one's.
     """
@@ -279,15 +284,18 @@ def predict(
     for body in bodies:
         if (pose := poses.get(body.name)) is None:
             continue
-        R = rotation_from_quaternion(pose.quaternion_wxyz)
         variance = pose.covariance.diagonal().tolist()
+        sigma = math.sqrt(max(variance[:3]))
+        if not sigma < LOST:
+            continue
+        R = rotation_from_quaternion(pose.quaternion_wxyz)
         for id, corners_body in body.corners.items():
             lever = corners_body @ R.T
             points.append(lever + pose.position)
             if line_time:
                 velocities.append(pose.velocity + np.cross(R @ pose.angular_velocity, lever))
             # m; a bound: the largest of each three, and the corner furthest away
-            known.append((id, math.sqrt(max(variance[:3])) + math.sqrt(max(variance[3:])) * body.reach[id]))
+            known.append((id, sigma + math.sqrt(max(variance[3:])) * body.reach[id]))
     if not known:
         return {}
     world = np.array(points)
@@ -296,11 +304,13 @@ def predict(
         # A row later, the robot is further.
         later = line_time * corners[..., 1].mean(axis=1)
         corners, depth = _seen_at(world + later[:, None, None] * np.array(velocities), intrinsics, world_from_camera)
+    (ax, ay), (bx, by) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 1]).T
+    # Clockwise in a picture with y down: its face is seen.
+    visible = (depth > 0.0) & (ax * by > ay * bx)
     focal = float(intrinsics.camera_matrix[0, 0])
     return {
-        id: Prediction(corners[k], sigma * focal / z)
-        for k, ((id, sigma), z) in enumerate(zip(known, depth.tolist(), strict=True))
-        if z > 0.0
+        id: Prediction(corners[k], sigma * focal / z) if seen else Prediction(_NOWHERE, 1.0)
+        for k, ((id, sigma), z, seen) in enumerate(zip(known, depth.tolist(), visible.tolist(), strict=True))
     }
 
 

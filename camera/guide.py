@@ -35,8 +35,9 @@ _STILL = 0.0015
 _ELSEWHERE, _NEARER, _TURNED_DEG = 0.08, 0.15, 10.0
 # Before there is a calibration: focal length as a part of the picture's width, as most cameras have it.
 _USUAL_FOCAL = 0.9
-# Views that are solved before the guess of the focal length is given up for theirs.
-_TRUSTED_VIEWS = 8
+# The guess is given up for the views' own focal length once that is known to this part of it: while the board has only
+# faced the camera, it can be anything.
+_TRUSTED_FOCAL = 0.05
 # A tilt that is asked for, deg, and the part of the picture that a target fills.
 _TILT_DEG, _FILLED = 32.0, 0.5
 _MOVE = "Move the board"
@@ -137,8 +138,10 @@ class Guide:
         self.criteria = judge(self.used, self.calibration)
 
     def _camera(self, view: BoardView) -> Intrinsics:
-        if self.calibration is not None and len(self.calibration.views) >= _TRUSTED_VIEWS:
-            return self.calibration.intrinsics
+        if self.calibration is not None:
+            found = self.calibration.intrinsics
+            if math.sqrt(self.calibration.covariance[0, 0]) < _TRUSTED_FOCAL * found.camera_matrix[0, 0]:
+                return found
         focal = _USUAL_FOCAL * view.width_px
         matrix = [[focal, 0.0, 0.5 * view.width_px], [0.0, focal, 0.5 * view.height_px], [0.0, 0.0, 1.0]]
         return Intrinsics(np.array(matrix), np.zeros(5), view.width_px, view.height_px)

@@ -1,8 +1,7 @@
 """Markers in an image: found, their corners measured, decoded.
 
 1. OpenCV's ArucoDetector finds quadrilaterals; those that it cannot decode are kept as well.
-2. Corners are measured on the image: intensity profiles across each side, an edge in each profile, a curve through the
-   edges of a side, corners where neighbouring sides meet. The error is about a tenth of the detector's.
+2. Corners are measured on the edges in the image, see `camera.edges`. The error is about a tenth of the detector's.
 3. What is inside is compared with every marker of the dictionary, blurred as the image may be. This reads markers that
    are too small or too blurred for hard bits, and rejects what only happens to have the right ones.
 """
@@ -131,8 +130,8 @@ _FIRST_LOOK = 0.65, 0.9
 # Correlation of the picture within the cells: thin strokes can have the right means, but not this. The second where
 # the sides show no clear edge and OpenCV reads no marker.
 _PICTURE, _PICTURE_UNCLEAR = 0.84, 0.87
-# Correlation of the picture and its margin where the marker is followed into blur. On rendered markers of 30 to 60 px
-# under all that benchmarks/camera.py has, those that are there reach 0.91, others at their place 0.83 and floors 0.55.
+# Correlation of the picture and its margin where a marker is followed into blur: between what markers that are there
+# reach and others at their place, see tests/camera/test_alignment.py.
 _ALIGNED = 0.87
 # Sigma of edges from which on the whole picture may know more, px.
 _BLURRED_PX = 0.25

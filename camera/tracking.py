@@ -37,11 +37,11 @@ REMEMBERED = 1.0
 # Sigma of where a marker is by what it did before, px, and of how it may speed up or turn meanwhile, in sides of the
 # marker per s²: 3 m/s² for one of 14 cm.
 _SIGMA_PX, _SWERVE = 1.0, 20.0
-# Frames in a row without a marker after which it is no longer looked for in every one, nor where it was.
+# Frames in a row without a marker after which it is no longer looked for in every one.
 _GIVEN_UP = 5
 # Frames, and s, between two searches of the whole picture while a marker is missing.
 SEARCH_EVERY, SEARCH_INTERVAL = 10, 0.5
-# s between two while none is missing, lest one is there twice.
+# s between two while none is missing, lest one is there twice, or where nobody thinks that it is.
 SWEEP_INTERVAL = 5.0
 
 # Of markers that are still, so many are looked at in a frame: enough to tell a shaken camera from a marker that moved.
@@ -120,20 +120,31 @@ class MarkerTracker:
     ) -> list[MarkerSighting]:
         """The markers of the next frame, by id. `image` as in `grey`; `t`: s, mid-exposure of its first row.
 
-        `predictions` by id, from whoever knows more than the last frames tell. `line_time`: s from one row's exposure
+        `predictions` by id, from whoever knows more than the last frames tell; what is predicted out of the picture is
+        not missed there. `line_time`: s from one row's exposure
         to the next one's; each sighting is stamped by the row of its middle.
         """
         picture = grey(image)
         # Those that were looked at longest ago have their turn.
         in_view = [id for id in self._still & self._tracks.keys() if self._missed[id] <= _GIVEN_UP]
         resting = frozenset(sorted(in_view, key=lambda id: self._tracks[id].t)[STILL_AT_ONCE:])
-        expected = self._expected(t, predictions or {}, resting)
+        predictions = predictions or {}
+        elsewhere = {
+            id
+            for id, where in predictions.items()
+            if _box(where.corners_px, 3.0 * where.sigma_px, picture.shape) is None
+        }
+        expected = self._expected(t, predictions, resting)
         found = self._follow(picture, t, expected)
-        missed = {id: where for id, where in expected.items() if id not in found}
+        # Where a prediction did not help, it may be wrong, and the robot where it was.
+        missed = {id: self._continued(id, t) or where for id, where in expected.items() if id not in found}
         if missed:
             found |= self._look_nearby(picture, missed)
         self._since_search += 1
-        if missing := self.ids - found.keys() - resting:
+        at_rest = self._still & self._tracks.keys()
+        # While one of them is where it was, the camera is too, and another that is not seen is hidden, not lost.
+        hidden = at_rest - found.keys() if at_rest & found.keys() else frozenset()
+        if missing := self.ids - found.keys() - hidden - elsewhere:
             due = self._since_search >= SEARCH_EVERY or not 0.0 <= t - self._searched < SEARCH_INTERVAL
             if due or any(self._missed.get(id) == 0 for id in missing):
                 found = self._search(picture, found, missing)
@@ -159,25 +170,36 @@ class MarkerTracker:
     ) -> dict[int, Prediction]:
         """Where to look: as predicted, unless what the last frames tell is better."""
         expected = {id: where for id, where in predictions.items() if id in self.ids}
-        for id, track in self._tracks.items():
-            dt = t - track.t
+        for id in self._tracks:
             if id in expected and expected[id].sigma_px <= NEAR_PX:
                 continue
-            if id in self._still:
-                own = Prediction(track.corners_px, _SIGMA_PX, track.sigma_px)
-            elif 0.0 <= dt <= REMEMBERED:
-                side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
-                sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
-                own = Prediction(track.corners_px + track.velocity_px * dt, sigma, track.sigma_px)
-            else:
-                continue
-            if id not in expected or own.sigma_px < expected[id].sigma_px:
+            own = self._continued(id, t)
+            if own is not None and (id not in expected or own.sigma_px < expected[id].sigma_px):
                 expected[id] = own
         return {
             id: where
             for id, where in expected.items()
-            if id not in self.repeated and id not in resting and self._missed.get(id, 0) <= _GIVEN_UP
+            if id not in self.repeated and id not in resting and self._worth_a_look(id)
         }
+
+    def _worth_a_look(self, id: int) -> bool:
+        """In every frame, if it was seen lately, else now and then."""
+        missed = self._missed.get(id, 0)
+        return missed <= _GIVEN_UP or missed % SEARCH_EVERY == 0
+
+    def _continued(self, id: int, t: float) -> Prediction | None:
+        """Where a marker is that was seen lately, if it goes on as it did."""
+        track = self._tracks.get(id)
+        if track is None:
+            return None
+        if id in self._still:
+            return Prediction(track.corners_px, _SIGMA_PX, track.sigma_px)
+        dt = t - track.t
+        if not 0.0 <= dt <= REMEMBERED:
+            return None
+        side = float(np.linalg.norm(track.corners_px[1] - track.corners_px[0]))
+        sigma = _SIGMA_PX + 0.5 * _SWERVE * side * dt * dt
+        return Prediction(track.corners_px + track.velocity_px * dt, sigma, track.sigma_px)
 
     def _follow(self, picture: Image, t: float, expected: Mapping[int, Prediction]) -> dict[int, Found]:
         """Those whose place and identity are known well enough for a look at their edges."""
@@ -226,7 +248,8 @@ class MarkerTracker:
         cheap = (_LONG, _SHORT) if shortest >= _LONG_PX else (_SHORT,) if shortest >= _SHORT_PX else (_TINY,)
         hard = _HARD if self.sides_px is not None and shortest >= _SHORT_PX else _HARD_AND_TINY
         last = hard[self._hard % len(hard)]
-        bounds = (SMALLEST_SIDE_PX, math.inf) if self.sides_px is None else _about(shortest, longest)
+        anything = SMALLEST_SIDE_PX, math.inf
+        expected = anything if self.sides_px is None else _about(shortest, longest)
         seen = list(found.values())
         if self.repeated or not missing:
             # The best of them: the others may see one of two.
@@ -235,7 +258,8 @@ class MarkerTracker:
             if way.scale > 1.0 and picture.size > ENLARGE_UP_TO:
                 continue
             before = len(seen)
-            seen = distinct(seen + self._detector.look(picture, way, bounds))
+            # The thorough look is at everything, lest a size in the configuration is wrong.
+            seen = distinct(seen + self._detector.look(picture, way, anything if way == _THOROUGH else expected))
             if set(missing) <= {marker.id for marker in seen}:
                 break
         else:

@@ -56,6 +56,9 @@ PLACE_LEAST, PLACE_SIGMAS, PLACE_SHARE, PLACE_FIXES, PLACE_GROUP = 0.015, 10.0, 
 PLACE_TURN, PLACE_LIKELY = math.radians(2.0), 0.05  # and the share from which the filter's states are not told
 RISE_LEAST = 0.15  # m between the 5th and the 95th percentile of the height
 WAY_PAIRS, WAY_STEP, WAY_SIGMAS = 20, 1.5, 8.0  # pairs of fixes, at most s apart
+# Of wheels: readings, what their scale may be, m and rad/s by which they are off when they slip, how often.
+WHEEL_READINGS, WHEEL_RANGE, SLIP_LEAST, SLIP_TIMES = 100, (0.7, 1.4), (0.05, 0.2), 3
+WHEEL_SCALE_LEAST = 0.01
 HEADING_LEAST, ASIDE_LEAST = 2.0, 0.15  # deg; share of the way
 LATE_SHARE, LATE_FIXES, LATE_OF_BUFFER = 0.01, 3, 0.8
 NO_FIX = 5.0  # s
@@ -65,7 +68,7 @@ BLOCK = 32  # samples
 
 BELIEVED = (Outcome.ACCEPTED, Outcome.INFLATED)
 _SENSORS = (("gyro", "gyroscope", "rad/s", slice(0, 3)), ("accel", "accelerometer", "m/s2", slice(3, 6)))
-_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates"}
+_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates", "wheel_unit"}
 _BESIDES = {"imu_missing", "imu_stamps_repeat", "no_fix", "fixes_lost", "fixes_late", "fixes_early"}
 _EIGHT = ("+x", "+x and +y", "+y", "-x and +y", "-x", "-x and -y", "-y", "+x and -y")
 
@@ -132,8 +135,9 @@ class Turns(NamedTuple):
 class Seen(NamedTuple):
     """All that a diagnosis looks at: of `WINDOW` before `now`, on the clock of the stamps.
 
-    `began`: stamp of the first sample, NaN before it. `stamps`: earliest and latest stamp of a fix ever, inf and -inf
-    before one. `fixes`: judged ones, by stamp. `lost`: how long after its stamp each arrived that came too late, s.
+    `began`: stamp of the first sample, NaN before it. `wheels` (m, 3): as in `WheelOdometry`, sorted. `stamps`:
+    earliest and latest stamp of a fix ever, inf and -inf before one. `fixes`: judged ones, by stamp. `lost`: how long
+    after its stamp each arrived that came too late, s.
     `learned`: now and then the time and the filter's noise scale.
     """
 
@@ -141,6 +145,7 @@ class Seen(NamedTuple):
     localiser: Localiser
     began: float
     chunks: Sequence[Chunk]
+    wheels: Array
     stamps: tuple[float, float]
     fixes: Sequence[JudgedFix]
     lost: Sequence[float]
@@ -158,12 +163,14 @@ def diagnose(seen: Seen) -> list[Diagnosis]:
         in_doubt = not gyro and (turns is None or _agreement(turns) < 0.8)
         found += [*_of_samples(seen, blocks, in_doubt), *_of_gravity(fixes, blocks), *gyro, *_of_rest(seen, blocks)]
     found += _of_arrivals(seen)
+    wheels = list(_of_wheels(seen, blocks)) if seen.chunks else []
+    found += [diagnosis for diagnosis in wheels if diagnosis.code in _ROOTS]
     codes = {diagnosis.code for diagnosis in found}
     for causes, besides in (({"imu_stamp_unit"}, set()), ({"fixes_clock"}, set()), (_ROOTS, _BESIDES)):
         if codes & causes:
             # Much else is wrong then, but nothing of it is the cause.
             return [diagnosis for diagnosis in found if diagnosis.code in causes | besides]
-    odd = [*_of_turns(fixes), *_of_motion(seen)]
+    odd = [*wheels, *_of_turns(fixes), *_of_motion(seen)]
     # Where the robot does not move as is assumed, innovations tell nothing else.
     places, likely = ([], False) if odd else _of_places(seen, 2 if planar else 3)
     if not odd and not places:
@@ -292,6 +299,12 @@ def _of_states(localiser: Localiser, understated: float) -> Iterator[Diagnosis]:
             text = f"the floor rises by {math.degrees(angle):.1f} deg towards {towards}; that is made up for"
             x, y = np.degrees(tilt).tolist()
             yield Diagnosis("floor_tilt", "note", text, {"x_deg": x, "y_deg": y, "chi2": chi2})
+    scales, of_scales = localiser.wheel_scale.tolist(), (understated * localiser.wheel_scale_sigma).tolist()
+    for what, scale, sigma in zip(("speed", "turning"), scales, of_scales, strict=True):
+        if sigma > 0.0 and abs(scale) >= max(WHEEL_SCALE_LEAST, SIGMAS * sigma):
+            size, way = f"{abs(scale):.1%} +- {sigma:.1%}", "much" if scale > 0.0 else "little"
+            text = f"the wheels tell {size} too {way} {what}; that is made up for"
+            yield Diagnosis(f"wheel_{what}", "note", text, {"scale": scale, "sigma": sigma})
 
 
 def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
@@ -307,7 +320,7 @@ def _of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
     moving = np.concatenate([[0], np.cumsum(~still)])
     groups: dict[tuple[str, tuple[int, ...]], list[JudgedFix]] = {}
     for fix in seen.fixes:
-        if not _is_turned(fix):
+        if not is_turned(fix):
             groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
     for (source, markers), own in groups.items():
         t = np.array([fix.outcome.t for fix in own]) + seen.localiser.time_offset
@@ -404,6 +417,55 @@ def _of_way(markers: tuple[int, ...], fixes: Sequence[JudgedFix]) -> Iterator[Di
             f"{share:.0%} of its way is sideways in its fixes: its wheels slip or slide, or it is no differential drive"
         )
         yield Diagnosis("wheels_slide", "warning", text, evidence | {"share": share, "sigmas": sigmas, "pairs": pairs})
+
+
+def _of_wheels(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
+    """Do the wheels go as far as the fixes, and turn as the gyroscope does?"""
+    times, most = 0, 0.0
+    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2)]
+    t = np.array([fix.outcome.t for fix in fixes]) + seen.localiser.time_offset
+    speed, rate = (seen.wheels[np.isfinite(seen.wheels[:, i])][:, [0, i]] for i in (1, 2))
+    if len(speed) >= WHEEL_READINGS and len(fixes) >= WAY_PAIRS:
+        way = np.interp(t, speed[:, 0], _integral(speed))
+        heading = np.unwrap([2.0 * math.atan2(z, w) for w, _, _, z in (fix.pose.quaternion_wxyz for fix in fixes)])
+        middle, turned = 0.5 * (heading[1:] + heading[:-1]), np.diff(heading)
+        x, y = np.diff([fix.pose.position[:2] for fix in fixes], axis=0).T
+        ahead = np.cos(middle) * x + np.sin(middle) * y
+        expected = np.diff(way) * np.sinc(turned / (2.0 * math.pi))  # the chord of an arc
+        noise = np.sqrt([2.0 * fix.pose.covariance[0, 0] for fix in fixes[1:]])
+        inside = (np.diff(t) <= WAY_STEP) & (t[:-1] >= speed[0, 0]) & (t[1:] <= speed[-1, 0])
+        moving = inside & (np.abs(expected) > 10.0 * noise)
+        if np.sum(moving) >= WAY_PAIRS:
+            scale = float(np.median(ahead[moving] / expected[moving]))
+            if not WHEEL_RANGE[0] < scale < WHEEL_RANGE[1]:
+                text = f"the robot goes {scale:.3g} x as far in its fixes as by its wheels: their unit, sign or radius"
+                evidence = {"times": scale, "pairs": int(np.sum(moving))}
+                yield Diagnosis("wheel_unit", "error", text, evidence)
+                return
+            off = (ahead - scale * expected)[inside]
+            spread = np.maximum(noise[inside], 1.4826 * float(np.median(np.abs(off))))
+            slips = np.abs(off) > np.maximum(6.0 * spread, SLIP_LEAST[0])
+            times += int(np.sum(slips[1:] & ~slips[:-1]))
+    if len(rate) >= WHEEL_READINGS:
+        ends = np.interp(blocks[:, :2].T, rate[:, 0], _integral(rate))
+        inside = (blocks[:, 0] >= rate[0, 0]) & (blocks[:, 1] <= rate[-1, 0]) & (blocks[:, 1] > blocks[:, 0])
+        turns = ((ends[1] - ends[0])[inside]) / (blocks[:, 1] - blocks[:, 0])[inside]
+        gyro = blocks[inside, 4] - seen.localiser.gyro_bias[2]
+        turning = np.abs(gyro) > 0.2
+        if np.sum(turning) >= WAY_PAIRS:
+            off = turns - float(np.median(turns[turning] / gyro[turning])) * gyro
+            slips = np.abs(off) > max(8.0 * 1.4826 * float(np.median(np.abs(off))), SLIP_LEAST[1])
+            times += int(np.sum(slips[1:] & ~slips[:-1]))
+            most = float(np.max(np.abs(off)[slips], initial=0.0))
+    if times >= SLIP_TIMES:
+        text = f"the wheels slip: {times} times they went or turned otherwise than the fixes and the gyroscope"
+        yield Diagnosis("wheels_slip", "warning", text, {"times": times, "most_rad_s": most})
+
+
+def _integral(values: Array) -> Array:
+    """(n,): over values (n, 2) of t and a rate, up to each."""
+    steps = np.diff(values[:, 0]) * 0.5 * (values[1:, 1] + values[:-1, 1])
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _of_learned(seen: Seen, known: set[str]) -> Iterator[Diagnosis]:
@@ -531,9 +593,10 @@ def _of_gyro(turns: Turns | None) -> Iterator[Diagnosis]:
             return
 
 
-def _is_turned(fix: JudgedFix) -> bool:
+def is_turned(fix: JudgedFix) -> bool:
+    """Its attitude is far off and was not believed; its position may have been."""
     outcome = fix.outcome
-    return outcome.outcome not in BELIEVED and float(np.linalg.norm(outcome.innovation[3:])) > TURNED_LEAST
+    return outcome.outcome is not Outcome.ACCEPTED and float(np.linalg.norm(outcome.innovation[3:])) > TURNED_LEAST
 
 
 def _of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
@@ -543,7 +606,7 @@ def _of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
         groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
     turned: list[tuple[str, dict[str, Any]]] = []
     for (source, markers), own in groups.items():
-        turn = np.array([fix.outcome.innovation[3:] for fix in own if _is_turned(fix)]).reshape(-1, 3)
+        turn = np.array([fix.outcome.innovation[3:] for fix in own if is_turned(fix)]).reshape(-1, 3)
         if not len(turn):
             continue
         angle = np.linalg.norm(turn, axis=1)
@@ -607,7 +670,7 @@ class Innovations(NamedTuple):
 
 def _innovations(seen: Seen) -> Innovations | None:
     """None where there are too few."""
-    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2) and not _is_turned(fix)]
+    fixes = [fix for fix in seen.fixes if math.isfinite(fix.outcome.d2) and not is_turned(fix)]
     markers, marker = _most([fix.markers for fix in fixes])
     cameras, camera = _most([fix.outcome.source for fix in fixes])
     # What the filter had of fixes before the first ones is not known.
@@ -644,29 +707,31 @@ def _of_places(seen: Seen, axes: int) -> tuple[list[Diagnosis], bool]:
     moved = np.einsum("nij,nj->ni", world_from_body, of.value[:, :3])[:, :axes]
     offset, covariance, share = _explanation(response, moved, total, of.used)
 
-    parts = []
-    for i in range(len(on_robot) + len(in_world)):
-        at = slice(axes * i, axes * (i + 1))
-        sigmas = math.sqrt(float(offset[at] @ np.linalg.solve(covariance[at, at], offset[at])))
-        parts.append((offset[at], float(np.linalg.norm(offset[at])), sigmas))
+    unit = np.eye(len(on_robot) + len(in_world))
+    parts = [_combined(signs, offset, covariance) for signs in unit]
+
     said: list[Diagnosis] = []
     off, likely = [], False
-    for markers, (by, size, sigmas) in zip(of.markers, parts, strict=False):
+    for i, (by, size, sigmas) in enumerate(parts[: len(of.markers)]):
         likely |= share >= PLACE_LIKELY and size >= PLACE_LEAST and sigmas >= SIGMAS
         if share >= PLACE_SHARE and size >= PLACE_LEAST and sigmas >= PLACE_SIGMAS:
-            off.append((markers, by, size, sigmas))
-    for markers, by, size, sigmas in off:
-        axis = int(np.argmax(np.abs(by)))
-        way = (("back", "right", "down"), ("front", "left", "up"))[int(by[axis] > 0.0)][axis]
-        several = len(of.markers) > 1
-        text = (
-            f"{_named(markers) if several else 'the marker'} sits {1e3 * size:.0f} mm or more farther to the {way} of "
-        )
-        text += "the robot than is entered"
-        text += ", or the IMU as much to the other side" if len(off) == len(of.markers) else ""
-        evidence: dict[str, Any] = {"markers": list(markers)} if several else {}
-        evidence |= {"mm": (1e3 * by).tolist(), "sigmas": sigmas, "explained": share}
-        said.append(Diagnosis("marker_place", "warning", text, evidence))
+            off.append(i)
+            axis = int(np.argmax(np.abs(by)))
+            way = (("back", "right", "down"), ("front", "left", "up"))[int(by[axis] > 0.0)][axis]
+            name = _named(of.markers[i]) if len(of.markers) > 1 else "the marker"
+            text = f"{name} sits {1e3 * size:.0f} mm or more farther to the {way} of the robot than is entered"
+            text += ", or the IMU as much to the other side" if len(of.markers) == 1 else ""
+            evidence: dict[str, Any] = {"markers": list(of.markers[i])} if len(of.markers) > 1 else {}
+            evidence |= {"mm": (1e3 * by).tolist(), "sigmas": sigmas, "explained": share}
+            said.append(Diagnosis("marker_place", "warning", text, evidence))
+    for i in range(1, len(of.markers)):
+        by, size, sigmas = _combined(unit[i] - unit[0], offset, covariance)
+        # Markers can be compared more sharply with each other than each with the IMU.
+        if not {0, i} & set(off) and share >= PLACE_SHARE and size >= PLACE_LEAST and sigmas >= PLACE_SIGMAS:
+            text = f"{_named(of.markers[0])} and {_named(of.markers[i])} disagree by {1e3 * size:.0f} mm: "
+            text += "one of them sits elsewhere on the robot than is entered"
+            evidence = {"markers": [*of.markers[0], *of.markers[i]], "mm": (1e3 * by).tolist(), "sigmas": sigmas}
+            said.append(Diagnosis("marker_place", "warning", text, evidence | {"explained": share}))
     for camera, (by, size, sigmas) in zip(of.cameras[1:], parts[len(of.markers) :], strict=True):
         if size >= CAMERA_LEAST and sigmas >= PLACE_SIGMAS:
             text = f"fixes of camera {camera} disagree with those of camera {of.cameras[0]} by {1e3 * size:.0f} mm"
@@ -675,6 +740,13 @@ def _of_places(seen: Seen, axes: int) -> tuple[list[Diagnosis], bool]:
     if len(of.markers) > 1:
         said += _of_headings(of)
     return said, likely or bool(said)
+
+
+def _combined(signs: Array, offset: Array, covariance: Array) -> tuple[Array, float, float]:
+    """A sum of the constants that stand together in `offset`, its length, and that in sigmas."""
+    pick = np.kron(signs, np.eye(len(offset) // len(signs)))
+    by = pick @ offset
+    return by, float(np.linalg.norm(by)), math.sqrt(float(by @ np.linalg.solve(pick @ covariance @ pick.T, by)))
 
 
 def _of_headings(of: Innovations) -> Iterator[Diagnosis]:

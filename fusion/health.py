@@ -33,9 +33,10 @@ from fusion.diagnosis import (
     Score,
     Seen,
     diagnose,
+    is_turned,
 )
 from fusion.localiser import Localiser
-from fusion.measurements import Array, FixOutcome, Outcome, Pose, PoseFix, PoseHypothesis
+from fusion.measurements import Array, FixOutcome, Outcome, Pose, PoseFix, PoseHypothesis, WheelOdometry
 from fusion.params import Channel
 
 NIS_FIXES = 60  # fixes of the running NIS
@@ -78,8 +79,9 @@ class _Poses:
 class Health:
     """The figures of one robot. Tell it in this order, around feeding the localiser:
 
-    `arrived(fix)` before a fix is fed; `judged(outcomes)` after; `sampled(samples, track)` after samples are. `channel`
-    is that of the track. Where poses are published apart from it, on the smooth channel, `published(pose)`.
+    `arrived(fix)` before a fix is fed; `judged(outcomes)` after; `sampled(samples, track)` and `wheels(odometry)` after
+    these are. `channel` is that of the track. Where poses are published apart from it, on the smooth channel,
+    `published(pose)`.
     """
 
     def __init__(self, localiser: Localiser, channel: Channel = "best") -> None:
@@ -94,6 +96,7 @@ class Health:
         self._last_fix = -math.inf
         self._oldest, self._newest = math.inf, -math.inf  # stamps of fixes
         self._chunks: deque[Chunk] = deque()
+        self._wheels: deque[Array] = deque(maxlen=20_000)
         self._arriving: dict[tuple[str, float, float], tuple[PoseFix, list[tuple[Array, float] | None]]] = {}
         self._fixes: deque[JudgedFix] = deque(maxlen=400)
         self._learned: deque[tuple[float, Array]] = deque(maxlen=round(WINDOW / LEARNED_STEP))
@@ -119,6 +122,12 @@ class Health:
             self._end += n
             self._given[0].add(track[at : at + _KEEP], self._last_fix)
         self._last_fix = self.localiser.last_fix
+
+    def wheels(self, odometry: WheelOdometry) -> None:
+        """Readings of the wheels that were fed."""
+        self._wheels.append(odometry.samples)
+        while self._wheels[0][-1, 0] < odometry.samples[-1, 0] - WINDOW:
+            self._wheels.popleft()
 
     def published(self, pose: Pose) -> None:
         """A pose that was given out, later than the one before."""
@@ -161,7 +170,7 @@ class Health:
     def _score(self, fix: JudgedFix) -> None:
         self._fixes.append(fix)
         outcome = fix.outcome.outcome
-        if outcome is Outcome.REJECTED:
+        if outcome is Outcome.REJECTED or (outcome is Outcome.INFLATED and is_turned(fix)):
             self._doubtful.append(fix)
             return
         before = list(self._doubtful) if outcome is Outcome.REINITIALISED else []
@@ -253,6 +262,8 @@ class Health:
             "gyro_bias_sigma": localiser.gyro_bias_sigma.tolist(),
             "accel_bias": localiser.accel_bias.tolist(),
             "accel_bias_sigma": localiser.accel_bias_sigma.tolist(),
+            "wheel_scale": localiser.wheel_scale.tolist(),
+            "wheel_scale_sigma": localiser.wheel_scale_sigma.tolist(),
             "fix_age_s": age if math.isfinite(age) else None,
             "fix_delay_ms": {"p50": _percentile(delays, 50, 1e3), "p95": _percentile(delays, 95, 1e3)},
             "fixes_reordered": self.reordered,
@@ -295,7 +306,9 @@ class Health:
         lost = [outcome.delay for outcome in self._late if outcome.arrival > since]
         learned = [look for look in self._learned if look[0] > since]
         stamps = self._oldest, self._newest
-        return Seen(now, self.localiser, self._began, self._chunks, stamps, fixes, lost, learned)
+        wheels = np.concatenate([np.empty((0, 3)), *self._wheels])
+        wheels = wheels[np.argsort(wheels[:, 0], kind="stable")]
+        return Seen(now, self.localiser, self._began, self._chunks, wheels, stamps, fixes, lost, learned)
 
 
 def _percentile(values: Sequence[float], percent: float, scale: float) -> float | None:

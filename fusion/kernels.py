@@ -30,8 +30,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, types
+from numba import njit, types
 from numba.extending import intrinsic
+from numba.np.numpy_support import carray
 
 from fusion.measurements import Array
 from fusion.params import GRAVITY
@@ -89,13 +90,15 @@ BLIND = AUX + 74  # 1 while what the IMU says is not what the robot does
 GRID_AT = AUX + 75  # number of the last step of the grid
 STILL_FORCE = AUX + 85  # m/s2: mean specific force since it is at rest (3)
 SYSTEMATIC = AUX + 88  # covariance of what the last fix taken had wrong in common with all others, world axes (36)
+TWINS = AUX + 124  # 1 while the shadow is the other pose of the first fix
+LEAD = AUX + 125  # by how much the scores of the fixes since then favour the filter over it
 CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
 PLACE = AUX + 76  # m: mean of where fixes have found it (3)
 PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (3)
 PLACE_COUNT = AUX + 82
 ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
 T_ADAPTED = AUX + 62  # s: the last of them
-STATE = AUX + 124
+STATE = AUX + 126
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -219,6 +222,7 @@ PLACE_TIME = 5.0  # s: for so long a robot keeps to a part of its usual place
 PLACE_FIXES = 120  # so many fixes say what that is
 LEAST_PLACE = 0.3  # m: and it is no smaller than this
 BLIND_TIME = 0.3  # s^0.5: noise of a sensor that is no witness, in its largest reading
+CLEAR_LEAD = 12.0  # twice the log of the odds
 MOST_BRIDGED = 60.0  # s
 COAST_TIME = 1.0  # s: nothing is known any more, and the speed decays with this time constant
 UNKNOWN_HEADING = 1.8  # rad: as uncertain as a heading can be, pi/√3
@@ -232,7 +236,10 @@ _fused: Any = njit(cache=True, error_model="numpy", nogil=True, fastmath={"contr
 _inline: Any = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 
 
-@intrinsic
+_intrinsic: Any = intrinsic
+
+
+@_intrinsic
 def _pointer(_context: Any, _address: Any) -> Any:
     """An address as a pointer to float64."""
     result = types.CPointer(types.float64)
@@ -596,6 +603,7 @@ def _weigh(s, o, prm, fix, H, y, R, S):
 
     R is the fix's covariance turned from world into body axes, and the stamp's jitter along the motion. The score of
     a hypothesis is d² + log|S| + misfit: twice the negative log-likelihood of the pose and of the pixels.
+    -> that of the chosen one.
     """
     B = np.empty((3, 3))
     _matrix(s[o:], B)
@@ -648,6 +656,7 @@ def _weigh(s, o, prm, fix, H, y, R, S):
         log_det = _distance(S, y, fix[F_D2:])
         score = fix[F_D2] + log_det + fix[k + H_MISFIT]
         if count == 1:
+            best = score
             break
         if trial == count:
             continue
@@ -662,6 +671,7 @@ def _weigh(s, o, prm, fix, H, y, R, S):
     for i in range(6):
         fix[F_INNOVATION + i] = y[i]
         fix[F_SIGMA + i] = math.sqrt(S[i, i])
+    return best
 
 
 @_jit
@@ -709,34 +719,13 @@ def _start(f, prm, fix, k, afresh):
 
 
 @_jit
-def _initialise(s, prm, fix):
-    """Start from the first fix; gravity decides between its poses, and corrects a tilt that is known badly."""
-    score = np.zeros(2)
+def _level(s, o, prm):
+    """Correct a tilt that is known badly by the mean specific force before the start, in the filter at s[o:].
+
+    It is g R̂ᵀu + b_a, u up: H = [g u_b]x on attitude, 1 on bias, g R̂ᵀ[e_x e_y] on tilt.
+    """
     B = np.empty((3, 3))
-    for h in range(int(fix[F_COUNT])):
-        k = F_HYPOTHESES + h * HYPOTHESIS
-        score[h] = fix[k + H_MISFIT]
-        if s[ACCEL_COUNT] > 0.0:
-            _matrix(fix[k + H_QUAT :], B)
-            for i in range(3):
-                score[h] += ((s[ACCEL_MEAN + i] - GRAVITY * B[2, i]) / GRAVITY_SIGMA) ** 2
-    chosen = F_HYPOTHESES
-    if fix[F_COUNT] > 1.0:
-        if score[1] < score[0]:
-            chosen += HYPOTHESIS
-        if abs(score[1] - score[0]) < prm[HYPOTHESIS_MARGIN]:
-            fix = fix.copy()
-            for i in range(3, 5):
-                fix[chosen + H_COV + 7 * i] += UNKNOWN_TILT_SIGMA * UNKNOWN_TILT_SIGMA
-    _start(s[:BLOCK], prm, fix, chosen, s[INITIALISED] == 0.0)
-    _fill(s[SYSTEMATIC : SYSTEMATIC + 36], fix[chosen + H_SYSTEMATIC :])
-    s[INITIALISED] = 1.0
-    s[ACCEPTED_COUNT] = 1.0
-    s[T_ACCEPTED] = s[T]
-    if s[ACCEL_COUNT] == 0.0:
-        return
-    # mean specific force = g R̂ᵀu + b_a, u up: H = [g u_b]x on attitude, 1 on bias, g R̂ᵀ[e_x e_y] on tilt
-    _matrix(s, B)
+    _matrix(s[o:], B)
     H, y, R, S = np.zeros((3, N)), np.empty(3), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):
         y[i] = s[ACCEL_MEAN + i] - GRAVITY * B[2, i]
@@ -751,12 +740,41 @@ def _initialise(s, prm, fix):
             S[i, j] = R[i, j]
             for m in range(N):
                 for n in range(N):
-                    S[i, j] += H[i, m] * s[COV + N * m + n] * H[j, n]
+                    S[i, j] += H[i, m] * s[o + COV + N * m + n] * H[j, n]
     # A fix whose tilt gravity denies is likely wrong: then nothing is to be learnt of the biases from it.
     d2 = np.empty(2)
     _distance(S, y, d2)
     if d2[0] <= prm[GATE_BLOCK]:
-        update(s[:BLOCK], H, y, R)
+        update(s[o : o + BLOCK], H, y, R)
+
+
+@_jit
+def _initialise(s, prm, fix):
+    """Start from the first fix. Where it has two poses gravity orders them, and the other starts the shadow filter."""
+    count = int(fix[F_COUNT])
+    score = np.zeros(2)
+    B = np.empty((3, 3))
+    for h in range(count):
+        k = F_HYPOTHESES + h * HYPOTHESIS
+        score[h] = fix[k + H_MISFIT]
+        if s[ACCEL_COUNT] > 0.0:
+            _matrix(fix[k + H_QUAT :], B)
+            for i in range(3):
+                score[h] += ((s[ACCEL_MEAN + i] - GRAVITY * B[2, i]) / GRAVITY_SIGMA) ** 2
+    for h in range(count):
+        # the better one first
+        other = count > 1 and (score[1] < score[0]) != (h == 1)
+        o = BLOCK * h
+        k = F_HYPOTHESES + (HYPOTHESIS if other else 0)
+        _start(s[o : o + BLOCK], prm, fix, k, s[INITIALISED] == 0.0)
+        if h == 0:
+            _fill(s[SYSTEMATIC : SYSTEMATIC + 36], fix[k + H_SYSTEMATIC :])
+        if s[ACCEL_COUNT] > 0.0:
+            _level(s, o, prm)
+    s[TWINS] = s[SHADOW_COUNT] = count - 1.0
+    s[INITIALISED] = 1.0
+    s[ACCEPTED_COUNT] = 1.0
+    s[T_ACCEPTED] = s[T]
 
 
 @_jit
@@ -818,7 +836,21 @@ def _judge(s, prm, fix):
     long without an accepted one, set the filter anew from the last: it is never locked out for good.
     """
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    shadows = s[SHADOW_COUNT] > 0.0
+    if s[TWINS] > 0.0:
+        # Which of the first fix's poses was it? Both go on until that is clear, the likelier one as the filter.
+        s[LEAD] -= _weigh(s, MAIN, prm, fix, H, y, R, S)
+        s[LEAD] += _weigh(s, SHADOW, prm, fix, H, y, R, S)
+        if fix[F_D2] <= prm[GATE] * prm[GATE_INFLATION]:
+            update(s[SHADOW:AUX], H, y, R)
+        if s[LEAD] < 0.0:
+            s[LEAD] = -s[LEAD]
+            for i in range(BLOCK):
+                swap = s[i]
+                s[i] = s[SHADOW + i]
+                s[SHADOW + i] = swap
+        if s[LEAD] > CLEAR_LEAD:
+            s[TWINS] = s[SHADOW_COUNT] = 0.0
+    shadows = s[SHADOW_COUNT] > 0.0 and s[TWINS] == 0.0
     agrees, partly = False, False
     figures = np.empty(F_REPORTED - F_D2)
     if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
@@ -872,7 +904,9 @@ def _judge(s, prm, fix):
                     s[SYSTEMATIC : SYSTEMATIC + 36],
                     fix[F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS + H_SYSTEMATIC :],
                 )
-                s[SHADOW_COUNT] = s[REJECTED_RUN] = 0.0
+                s[REJECTED_RUN] = 0.0
+                if s[TWINS] == 0.0:
+                    s[SHADOW_COUNT] = 0.0
                 s[ACCEPTED_COUNT] += 1.0
                 s[T_ACCEPTED] = s[T]
                 n = min(s[PLACE_COUNT] + 1.0, PLACE_FIXES)
@@ -893,6 +927,7 @@ def _judge(s, prm, fix):
     far = _length(figures[F_INNOVATION - F_D2 :]) > OUTLIER_DISTANCE
     turned = _length(figures[F_INNOVATION - F_D2 + 3 :]) > prm[REINIT_ANGLE]
     s[REJECTED_RUN] += 1.0
+    s[TWINS] = 0.0
     if agrees or not (far or turned) or s[REJECTED_RUN] >= prm[REINIT_COUNT]:
         _adapt(s, prm, figures, 0.0 if turned else MOST_TAUGHT)
     if not shadows:

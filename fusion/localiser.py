@@ -42,6 +42,10 @@ def warm_up(engine: Engine = "numba") -> None:
     localiser._timeline.feed_fix(np.zeros(k.FIX))
 
 
+# So many IMU samples in a row that are older than the buffer, and none that is not: their clock has gone back.
+CLOCK_WENT_BACK = 20
+
+
 class Localiser:
     """The pose of one robot, from its IMU and from fixes in any order of arrival.
 
@@ -64,6 +68,9 @@ class Localiser:
         self._timeline = _timeline(engine, self.params, motion)
         self._outcomes = dict.fromkeys(Outcome, 0)
         self._samples = self._readings = 0
+        self._late_run = 0
+        self._before: dict[str, int] = {}  # figures of timelines that were given up
+        self._resets = 0  # and how often their poses had been set anew
         self._sources: dict[tuple[float, float], str] = {}
 
     def feed(
@@ -96,7 +103,21 @@ class Localiser:
         stamp, unless that came late), position, quaternion wxyz; NaN before the first fix.
         """
         self._samples += len(samples)
-        self._timeline.feed_samples(samples, track, channel)
+        if self._timeline.feed_samples(samples, track, channel) or not len(samples):
+            self._late_run = 0
+            return
+        if samples[:, 0].max() < self._timeline.state[k.T_IMU] - self.params.buffer:
+            self._late_run += len(samples)
+            if self._late_run >= CLOCK_WENT_BACK:
+                self._start_again()
+
+    def _start_again(self) -> None:
+        last = self._timeline.pose_at(float(self._timeline.state[k.T]), "smooth")
+        self._resets += 1 if last is None else 1 + int(last[k.P_RESET_ID])
+        self._before = {name: n + self._before.get(name, 0) for name, n in self._timeline.figures.items()}
+        self._timeline = _timeline(self.engine, self.params, self.motion)
+        self._sources.clear()
+        self._late_run = 0
 
     def judged(self) -> list[FixOutcome]:
         """The fixes judged since this was last asked; `feed` asks by itself."""
@@ -128,7 +149,7 @@ class Localiser:
         return (
             {outcome.name.lower(): n for outcome, n in self._outcomes.items() if outcome is not Outcome.PENDING}
             | {"imu_samples": self._samples, "wheel_samples": self._readings}
-            | self._timeline.figures
+            | {name: n + self._before.get(name, 0) for name, n in self._timeline.figures.items()}
         )
 
     @property
@@ -237,7 +258,7 @@ class Localiser:
             covariance=covariance,
             velocity_covariance=row[k.P_VCOV : k.P_VCOV + 9].reshape(3, 3),
             mode=self._mode(fix_age, t - float(row[k.P_T_IMU]), covariance),
-            reset_id=int(row[k.P_RESET_ID]),
+            reset_id=self._resets + int(row[k.P_RESET_ID]),
             fix_age=fix_age,
             reset_step=row[k.P_STEP : k.P_STEP + 6],
         )

@@ -115,7 +115,7 @@ class PoseHypothesis:
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "quaternion_wxyz", quaternion / norm)
         object.__setattr__(self, "covariance", 0.5 * (covariance + covariance.T))
-        object.__setattr__(self, "systematic", systematic)
+        object.__setattr__(self, "systematic", 0.5 * (systematic + systematic.T))
 
 
 @dataclass(frozen=True, slots=True)

@@ -226,6 +226,7 @@ class _State:
         self.main = ErrorStateFilter()
         self.shadow: ErrorStateFilter | None = None
         self.shadow_count = 0
+        self.twins, self.lead = False, 0.0
         self.rejected_since, self.rejected_run = 0.0, 0
         self.t = self.t_imu = self.t_accepted = -math.inf
         self.u = np.zeros(6)
@@ -642,24 +643,27 @@ class ReferenceTimeline:
         return self._hypothesis(fix, int(fix[k.F_CHOSEN]))
 
     def _initialise(self, state: _State, fix: Array) -> None:
-        p = self._params
-        state.main = f = ErrorStateFilter()
         scores = []
         for i in range(int(fix[k.F_COUNT])):
             pose = self._hypothesis(fix, i)
             up = rotation_from_quaternion(pose[k.H_QUAT : k.H_QUAT + 4])[2]
             denied = (state.accel_mean - GRAVITY * up) / k.GRAVITY_SIGMA if state.accel_count else np.zeros(3)
             scores.append(float(pose[k.H_MISFIT] + denied @ denied))
-        hypothesis = self._hypothesis(fix, int(np.argmin(scores))).copy()
-        if len(scores) > 1 and abs(scores[1] - scores[0]) < p.hypothesis_margin:
-            for i in (3, 4):
-                hypothesis[k.H_COV + 7 * i] += k.UNKNOWN_TILT_SIGMA**2
-        f.P = self._prior()
-        f.start(hypothesis, p.velocity_sigma)
-        state.systematic = hypothesis[k.H_SYSTEMATIC :]
+        order = np.argsort(scores, kind="stable")
+        filters = [self._first(state, self._hypothesis(fix, i)) for i in order]
+        state.main = filters[0]
+        state.systematic = self._hypothesis(fix, order[0])[k.H_SYSTEMATIC :]
+        if len(filters) > 1:
+            state.shadow, state.shadow_count, state.twins, state.lead = filters[1], 1, True, 0.0
         state.initialised = True
         state.accepted_count = 1
         state.t_accepted = state.t
+
+    def _first(self, state: _State, hypothesis: Array) -> ErrorStateFilter:
+        """A filter that starts from a pose, its tilt corrected by gravity."""
+        f = ErrorStateFilter()
+        f.P = self._prior()
+        f.start(hypothesis, self._params.velocity_sigma)
         if state.accel_count:
             force = GRAVITY * f.rotation.T @ f.up
             H = np.zeros((3, N))
@@ -667,13 +671,38 @@ class ReferenceTimeline:
             H[:, DBA] = _I3
             H[:, DTILT] = GRAVITY * f.rotation.T[:, :2]
             y, R = state.accel_mean - force, k.GRAVITY_SIGMA**2 * _I3
-            if _d2(H @ f.P @ H.T + R, y) <= p.gate_block:
+            if _d2(H @ f.P @ H.T + R, y) <= self._params.gate_block:
                 f.correct(H, y, R)
+        return f
 
     def _prior(self) -> Array:
         p = self._params
         sigmas = [0.0] * 9 + [p.gyro_bias_sigma] * 3 + [p.accel_bias_sigma] * 3 + [p.time_offset_sigma]
         return np.diag(np.square([*sigmas, *[p.tilt_sigma] * 2, *[p.wheel_scale_sigma] * 2]))
+
+    def _score(self, state: _State, f: ErrorStateFilter, fix: Array) -> float:
+        """Of the hypothesis that fits a filter best, see `kernels._weigh`."""
+        rate = np.zeros(3) if state.bridging else state.u[:3] - f.gyro_bias
+        scores = []
+        for i in range(int(fix[k.F_COUNT])):
+            H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
+            S = H @ f.P @ H.T + self._rescaled(state, R)
+            scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
+        return float(min(scores))
+
+    def _tell_apart(self, state: _State, fix: Array) -> None:
+        """Which of the first fix's poses was it? See `kernels._judge`."""
+        p, other = self._params, state.shadow
+        assert other is not None
+        state.lead += self._score(state, other, fix) - self._score(state, state.main, fix)
+        H, y, R, _ = self._weigh(state, other, fix)
+        if fix[k.F_D2] <= p.gate * p.gate_inflation:
+            other.correct(H, y, R)
+        if state.lead < 0.0:
+            state.lead = -state.lead
+            state.main, state.shadow = other, state.main
+        if state.lead > k.CLEAR_LEAD:
+            state.twins, state.shadow, state.shadow_count = False, None, 0
 
     def _weigh(self, state: _State, f: ErrorStateFilter, fix: Array) -> tuple[Array, Array, Array, Array]:
         """Choose the hypothesis, write the fix's figures. -> H, y, R, S."""
@@ -741,7 +770,9 @@ class ReferenceTimeline:
 
     def _judge(self, state: _State, fix: Array) -> None:
         p = self._params
-        main = state.main
+        if state.twins:
+            self._tell_apart(state, fix)
+        main, shadow = state.main, None if state.twins else state.shadow
         H, y, R, S = self._weigh(state, main, fix)
         if main.P.diagonal()[TH].max() > 2.0 * k.UNKNOWN_HEADING**2:
             # after so long without an IMU nothing is left to weigh the fix by
@@ -766,7 +797,9 @@ class ReferenceTimeline:
                 fix[k.F_OUTCOME] = k.INFLATED
                 R = R + (ratio - 1.0) * S
             main.correct(H, y, R)
-            state.shadow, state.shadow_count, state.rejected_run = None, 0, 0
+            state.rejected_run = 0
+            if not state.twins:
+                state.shadow, state.shadow_count = None, 0
             state.accepted_count += 1
             state.t_accepted = state.t
             state.systematic = self._chosen(fix)[k.H_SYSTEMATIC :]
@@ -784,13 +817,14 @@ class ReferenceTimeline:
             alone[:3, :3] = R[:3, :3]
             main.correct(H, y, alone)
             state.t_accepted = state.t
-        if state.shadow is None:
+        state.twins = False
+        if shadow is None:
             state.rejected_since = state.t
         patient = state.t - state.rejected_since >= p.reinit_patience
         known = state.accepted_count >= 2 * p.reinit_count
         agrees = False
-        if state.shadow is not None:
-            H, y, R, S = self._weigh(state, state.shadow, fix)
+        if shadow is not None:
+            H, y, R, S = self._weigh(state, shadow, fix)
             ratio = self._gate_ratio(fix)
             agrees = ratio <= p.gate_inflation
             R = R + max(ratio - 1.0, 0.0) * S
@@ -798,26 +832,26 @@ class ReferenceTimeline:
         y_main = figures[k.F_INNOVATION - k.F_D2 : k.F_SIGMA - k.F_D2]
         far = float(np.linalg.norm(y_main[:3])) > k.OUTLIER_DISTANCE
         turned = float(np.linalg.norm(y_main[3:])) > p.reinit_angle
-        if state.shadow is not None and agrees:
-            state.shadow.correct(H, y, R)
+        if shadow is not None and agrees:
+            shadow.correct(H, y, R)
         state.rejected_run += 1
         if agrees or not (far or turned) or state.rejected_run >= p.reinit_count:
             self._adapt(state, figures, 0.0 if turned else k.MOST_TAUGHT)
-        if state.shadow is not None and agrees:
+        if shadow is not None and agrees:
             state.shadow_count += 1
             take = state.shadow_count >= p.reinit_count and (
-                patient or not known or self._attitudes_agree(state, main, state.shadow)
+                patient or not known or self._attitudes_agree(state, main, shadow)
             )
         else:
-            state.shadow = copy.copy(main)
+            shadow = copy.copy(main)
             if not known:
-                state.shadow = ErrorStateFilter()
-                state.shadow.P = self._prior()
-            state.shadow.start(self._chosen(fix), p.velocity_sigma)
-            state.shadow_count = 1
+                shadow = ErrorStateFilter()
+                shadow.P = self._prior()
+            shadow.start(self._chosen(fix), p.velocity_sigma)
+            state.shadow, state.shadow_count = shadow, 1
             take = patient or (state.rejected_run >= 2 * p.reinit_count and not (turned and partly))
         if take:
-            state.main = state.shadow
+            state.main = shadow
             self._restarted(state, fix, state.shadow_count)
 
     def _gate_ratio(self, fix: Array) -> float:

@@ -349,8 +349,9 @@ def _fixes(rng: Generator, robot: str, trajectory: Trajectory, duration: float, 
     position = motion.position + camera.position_sigma * rng.standard_normal((n, 3))
     attitude = motion.attitude * Rotation.from_rotvec(camera.attitude_sigma * rng.standard_normal((n, 3)))
     covariance = np.tile(np.diag([camera.position_sigma**2] * 3 + [camera.attitude_sigma**2] * 3), (n, 1, 1))
+    systematic = np.zeros((n, 6, 6))
     if camera.marker is not None:
-        error, covariance = _through_the_picture(marker_rng, motion, camera.position, camera.marker)
+        error, covariance, systematic = _through_the_picture(marker_rng, motion, camera.position, camera.marker)
         position = motion.position + error[:, :3]
         attitude = Rotation.from_rotvec(error[:, 3:]) * motion.attitude
     # A flat marker seen along d, a unit vector, looks nearly the same when its normal is mirrored at d: to mirror the
@@ -375,7 +376,8 @@ def _fixes(rng: Generator, robot: str, trajectory: Trajectory, duration: float, 
         poses = []
         for order in range(2 if camera.two_poses else 1):
             positions, quaternions = placed[order ^ flipped[i]]
-            poses.append(PoseHypothesis(positions[i], quaternions[i], covariance[i], misfit[i, order]))
+            pose = PoseHypothesis(positions[i], quaternions[i], covariance[i], misfit[i, order], systematic[i])
+            poses.append(pose)
         markers = () if camera.wrong is None else (camera.wrong.id if wrong[i] else 1,)
         fixes.append(PoseFix(robot, float(stamp[i]), float(arrival[i]), tuple(poses), "simulated", markers))
     return fixes
@@ -386,8 +388,9 @@ _SOLVED, _ASSUMED = [0, 1, 5], [2, 3, 4]  # of a pose on the floor: x, y, yaw; h
 
 def _through_the_picture(
     rng: Generator, motion: TrueMotion, camera: tuple[float, float, float], marker: MarkerParams
-) -> tuple[Array, Array]:
-    """Errors (n, 6) and covariances (n, 6, 6) of fixes, position and rotation in world axes.
+) -> tuple[Array, Array, Array]:
+    """Errors (n, 6) of fixes, their covariances (n, 6, 6), and of these the part that is the same for the whole drive;
+    position and rotation in world axes.
 
     The camera's axes are the world's: a place (x, y) m beside the camera and d below it is seen at (x, y) f / d.
     """
@@ -424,6 +427,7 @@ def _through_the_picture(
     columns = _SOLVED if marker.on_floor else list(range(6))
     gain[:, columns] = np.linalg.pinv(J[:, :, columns])
     error, covariance = gain @ off, gain @ of_corners @ gain.swapaxes(1, 2)
+    systematic = np.zeros_like(covariance)
     if marker.on_floor:
         # What is taken as known is wrong, by roll and pitch about the body's axes, and what is solved answers to that.
         by_assumed = gain @ J[:, :, _ASSUMED]
@@ -432,8 +436,8 @@ def _through_the_picture(
         by_assumed[:, :, 1:] = by_assumed[:, :, 1:] @ heading
         sigma = np.diag([marker.height_sigma, marker.tilt_sigma, marker.tilt_sigma])
         error += (by_assumed @ assumed)[..., np.newaxis]
-        covariance += by_assumed @ sigma**2 @ by_assumed.swapaxes(1, 2)
-    return error[..., 0], covariance
+        systematic = by_assumed @ sigma**2 @ by_assumed.swapaxes(1, 2)
+    return error[..., 0], covariance + systematic, systematic
 
 
 def _in_view(rng: Generator, t: Array, wrong: WrongMarker) -> Array:

@@ -41,9 +41,10 @@ ALIKE = 0.002
 # s: where counters start again from zero: ticks of 1 us and 1 ms in 16, 24 or 32 bits, the day, the GPS week. Not below
 # some seconds: a device that restarts again and again would be taken for one whose counter wraps.
 WRAPS = (2**24 * 1e-6, 2**16 * 1e-3, 2**32 * 1e-6, 2**24 * 1e-3, 86400.0, 604800.0, 2**32 * 1e-3)
-# Questions kept, and by how much (s per s of age) an older one is trusted less: the error of the slope.
+# Questions kept, for as long as the window at one a second, and by how much (s per s of age) an older one is trusted
+# less: the error of the slope.
 EXCHANGES = 64
-AGEING = 1e-5
+AGEING = 3e-6
 # s: the distance between samples that arrive together and bring no stamps, where nothing better is known because the
 # one before came longer ago than this for each of them.
 UNSTAMPED_SPACING = 1e-3

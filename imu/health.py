@@ -472,11 +472,11 @@ def _newest(rows: Array) -> Array:
 
 
 def _arrivals(rows: Array) -> tuple[Array, Array]:
-    """s between arrivals, and s that the newest sample of each took, by its stamp."""
+    """s between arrivals, and s that the newest sample of each took, by its stamp, where the device stamped it."""
     newest = _newest(rows)
     intervals: Array = np.diff(newest[:, _ARRIVAL])
     delays: Array = newest[:, _ARRIVAL] - newest[:, _T]
-    return intervals, delays
+    return intervals, delays[np.isfinite(newest[:, _DEVICE])]
 
 
 def _direction(force: Array) -> str:

@@ -53,6 +53,7 @@ from server.messages import (
     MessageError,
     Notice,
     Welcome,
+    Wheels,
     decode_hello,
     decode_watch,
 )
@@ -328,7 +329,8 @@ class Service:
 
         def look() -> None:
             robots = self.robots if self.ready.is_set() else {}
-            poses = {name: robot.localiser.pose_at(t) for name, robot in robots.items()}
+            # What the filters find the camera's stamps to be off by is theirs alone.
+            poses = {name: r.localiser.pose_at(t + r.localiser.time_offset) for name, r in robots.items()}
             answer.set_result({name: pose for name, pose in poses.items() if pose is not None})
 
         self._call_from_thread(look)
@@ -718,7 +720,7 @@ class Service:
             raise RefusedError(f'the IMU of "{hello.robot}" is on {robot.config.imu.source}, by the configuration')
         link = self._take(robot, visitor)
         rate_hz = min(hello.pose_rate_hz, self.config.server.pose_rate_hz)
-        await visitor.tell(Welcome(hello.robot, SERVICE, rate_hz))
+        visitor.tell_now(Welcome(hello.robot, SERVICE, rate_hz))
         log.info("robot %s has connected", hello.robot)
         topics = [f"own/{hello.robot}"] if rate_hz > 0.0 else []
         clock = asyncio.create_task(self._ask_clock(link))
@@ -784,6 +786,10 @@ class Service:
                 robot.feed_imu(readings, arrival, arrival)
                 if robot.clock.restarts > restarts:
                     self._note(robot.config.name, f"its clock has jumped or started anew; it reads {readings[-1][0]} s")
+            case Wheels() as message:
+                wheels = dialect.wheels(message)
+                if self.ready.is_set():
+                    robot.feed_wheels(wheels, arrival)
             case ClockAnswer(id, received, sent):
                 link.questions.take(id, dialect.seconds(received), dialect.seconds(sent), arrival, robot.clock)
             case Hello():
@@ -795,7 +801,7 @@ class Service:
         if subscription.topics and self.ready.is_set() and subscription.is_due(now, early=True):
             pose = self._pose(robot, now)
             if pose is not None:
-                self.hub.answer(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
+                self.hub.send(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
 
     async def _ask_clock(self, link: _Link) -> None:
         visitor, questions = link.visitor, link.questions

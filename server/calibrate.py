@@ -21,7 +21,7 @@ from camera.capture import IMAGE_SUFFIXES, FrameSource, open_source, read_image
 from camera.guide import Guide, Step
 from camera.markers import Pixels, grey
 from server.calibration_page import CalibrationPage
-from server.listening import is_local, port_number, reachable
+from server.listening import is_local, own_address, port_number, reachable
 
 DEFAULT_PORT = 5679
 # s without a frame after which a camera counts as lost; s before it is tried again, doubled up to the longest.
@@ -144,7 +144,7 @@ class Guided:
                 f"http://{reachable(self._args.host)}:{page.port}/ shows the picture and what to do; so do these lines"
             )
             if not is_local(self._args.host):
-                _say("anyone on this network can see the picture")
+                _say(f"anyone on this network can see it, at http://{own_address()}:{page.port}/")
             try:
                 while not self.guide.done:
                     try:

@@ -70,7 +70,8 @@ class MarkerSeen(Struct, frozen=True):
 
 class FrameSeen(Struct, frozen=True, tag_field="type", tag="frame"):
     """What one frame showed, which may be nothing. `t`: mid-exposure of its first row; `sent`: when this message left;
-    both s of the node's clock. `detect_ms`: what finding the markers took."""
+    both s of the node's clock. `detect_ms`: what finding the markers took. `repeated`: ids that are at several places,
+    and left out."""
 
     t: _Time
     sent: _Time
@@ -79,6 +80,7 @@ class FrameSeen(Struct, frozen=True, tag_field="type", tag="frame"):
     height_px: _Size
     detect_ms: float
     markers: Annotated[list[MarkerSeen], Meta(max_length=200)]
+    repeated: Annotated[list[int], Meta(max_length=200)] = []
 
 
 class NodeStatus(Struct, frozen=True, tag_field="type", tag="status"):

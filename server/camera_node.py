@@ -139,8 +139,9 @@ class Watch:
         markers = [MarkerSeen(s.id, s.t, s.corners_px.tolist(), s.sigma_px, _known(s.blur_px)) for s in sightings]
         height_px, width_px = frame.image.shape[:2]
         detect_ms = 1e3 * (time.monotonic() - start)
+        repeated = sorted(self._tracker.repeated)
         # When it is sent is to be seen.
-        self._seen(FrameSeen(frame.t, frame.t, frame.sequence, width_px, height_px, detect_ms, markers))
+        self._seen(FrameSeen(frame.t, frame.t, frame.sequence, width_px, height_px, detect_ms, markers, repeated))
 
 
 class Node:

@@ -17,12 +17,12 @@ import numpy as np
 from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import Delivery, DeliveryMeter, EdgeBlur, advice, black, blur_px
-from camera.fix import Body, MarkerMount, marker_poses, predict, rays, solve
+from camera.fix import Body, MarkerMount, marker_corners, marker_poses, predict, project, rays, solve
 from camera.floor import Anchor, Placement, PlacementError, averaged, load_placement, locate_camera
 from camera.markers import MarkerSighting
 from camera.shake import measure_shake, shaken
-from camera.tracking import MarkerTracker
-from fusion.geometry import exp_so3, log_so3, rotation_about_z, transform
+from camera.tracking import MarkerTracker, Prediction
+from fusion.geometry import exp_so3, inverse, log_so3, rotation_about_z, transform, transform_points
 from fusion.measurements import Array, Pose, PoseFix
 from server.config import AnchorConfig, CameraConfig, Config, ConfigError, MarkerConfig
 from server.messages import tracker_message
@@ -56,7 +56,7 @@ class Seen:
 class SightedFrame:
     """A frame that was looked at elsewhere: its stamp (s, host monotonic), its size and what was seen in it.
 
-    `detect_ms`: how long that took.
+    `detect_ms`: how long that took. `repeated`: ids that were seen at several places, and left out.
     """
 
     t: float
@@ -65,6 +65,7 @@ class SightedFrame:
     height_px: int
     sightings: list[MarkerSighting]
     detect_ms: float
+    repeated: frozenset[int]
 
 
 class Source(Protocol):
@@ -161,8 +162,11 @@ class Camera:
         self._next_look = -math.inf
         self._settled = self.placement is not None
         self._moved = False
-        # The placement that the tracking knows the size of markers for.
+        # The placement that the tracking knows the size of markers for, and the camera's pose as in the last frame.
         self._sides_of: Placement | None = None
+        self._world_from_camera = np.eye(4)
+        # Anchors that this camera cannot see from there.
+        self._anchors_elsewhere: dict[int, Prediction] = {}
         # The anchors' corners while the camera hangs as it was found to, px, by id.
         self._at_rest: dict[int, Array] = {}
         self._arrivals: deque[float] = deque()
@@ -238,6 +242,7 @@ class Camera:
         arrival = time.monotonic()
         if isinstance(frame, SightedFrame):
             self._take_size(frame.width_px, frame.height_px)
+            self._take_repeated(frame.repeated)
             sightings, self.detect_ms = frame.sightings, frame.detect_ms
         else:
             self._take_size(frame.image.shape[1], frame.image.shape[0])
@@ -268,20 +273,39 @@ class Camera:
         if (placement := self.placement) is not None:
             if placement is not self._sides_of:
                 self._sides_of, self._tracking.sides_px = placement, self._sides_px(placement)
+                self._world_from_camera = placement.world_from_camera
+                self._anchors_elsewhere = self._out_of_view(placement)
             poses = self._poses_at(t)
-            predictions = predict(self._bodies, poses, self.intrinsics, placement.world_from_camera, frame.line_time)
+            predictions = predict(self._bodies, poses, self.intrinsics, self._world_from_camera, frame.line_time)
+            predictions |= self._anchors_elsewhere
         sightings = self._tracking.track(frame.image, t, self.config.name, predictions, frame.line_time)
-        if (repeated := self._tracking.repeated) != self.repeated:
+        self._take_repeated(self._tracking.repeated)
+        return sightings
+
+    def _take_repeated(self, repeated: frozenset[int]) -> None:
+        if repeated != self.repeated:
             self.repeated = repeated
             for text in self._repetitions().values():
                 log.warning("camera %s: %s", self.config.name, text)
-        return sightings
 
     def _repetitions(self) -> dict[str, str]:
         return {
             f"marker {id}": f"marker {id} is in view more than once; which one is meant cannot be told, so none is used"
             for id in sorted(self.repeated)
         }
+
+    def _out_of_view(self, placement: Placement) -> dict[int, Prediction]:
+        """Where the anchors should be seen that are far from the picture or behind the camera."""
+        size, far = np.array(self._image_size), {}
+        for anchor in self._anchors:
+            points = transform_points(
+                inverse(placement.world_from_camera) @ anchor.world_from_marker, marker_corners(anchor.size)
+            )
+            behind = points[:, 2].min() < 1e-3
+            corners = np.full((4, 2), -1e6) if behind else project(points, self.intrinsics)[0]
+            if (corners.max(axis=0) < -0.1 * size).any() or (corners.min(axis=0) > 1.1 * size).any():
+                far[anchor.id] = Prediction(corners, 1.0)
+        return far
 
     def _sides_px(self, placement: Placement) -> tuple[float, float]:
         """How long the sides of the smallest and the largest marker appear, anywhere in the picture."""
@@ -353,6 +377,7 @@ class Camera:
         world_from_camera, covariance = placement.world_from_camera, placement.covariance
         if (shake := measure_shake(self._at_rest, sightings, self.intrinsics)) is not None:
             world_from_camera, covariance = shaken(world_from_camera, covariance, shake)
+        self._world_from_camera = world_from_camera
         return solve(
             self._bodies,
             sightings,
@@ -458,7 +483,10 @@ def _moved(kept: Placement, found: Placement) -> float | None:
 
 
 def _view_on_floor(placement: Placement, intrinsics: Intrinsics, width_px: int, height_px: int) -> list[list[float]]:
-    """The outline of what the camera sees of the floor, m: the border of the image cut with z = 0."""
+    """The outline of what the camera sees of the floor, m: the border of the image cut with z = 0; [] before a picture
+    has told its size."""
+    if not width_px:
+        return []
     u, v = np.linspace(0.0, width_px - 1.0, 9), np.linspace(0.0, height_px - 1.0, 9)
     border = (
         [(x, 0.0) for x in u] + [(u[-1], y) for y in v] + [(x, v[-1]) for x in u[::-1]] + [(0.0, y) for y in v[::-1]]

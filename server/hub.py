@@ -82,13 +82,10 @@ class Hub:
             if subscription.is_due(now):
                 wanted = subscription.topics & messages.keys()
                 if wanted:
-                    self._send(subscription, now, [messages[topic] for topic in messages if topic in wanted])
+                    self.send(now, subscription, *(messages[topic] for topic in messages if topic in wanted))
 
-    def answer(self, now: float, subscription: Subscription, message: bytes) -> None:
-        """Send one client a message that is due, perhaps early."""
-        self._send(subscription, now, [message])
-
-    def _send(self, subscription: Subscription, now: float, messages: Collection[bytes]) -> None:
+    def send(self, now: float, subscription: Subscription, *messages: bytes) -> None:
+        """To one client that is due, perhaps early."""
         if subscription.waiting() > subscription.room:
             self.dropped += len(messages)
             return

@@ -267,14 +267,14 @@ def _text(report: dict[str, Any]) -> str:
     lines.append(f"  gaps     {report['gaps']}{longest} in the last {WINDOW:.0f} s")
     if clock := report["clock"]:
         lines.append(
-            f"  clock    offset {clock['offset_s']:+.6f} s, skew {clock['skew_ppm']:+.0f} ppm, "
+            f"  clock    the device's {clock['offset_s']:+.6f} s is this machine's, skew {clock['skew_ppm']:+.0f} ppm, "
             f"{clock['restarts']} restarts"
         )
     elif report["stamped"] is False:
         lines.append("  clock    the samples bear no time")
-    if report["delay_jitter_ms"] is not None:
-        every = f", arrivals every {report['arrival_interval_ms']:.1f} ms" if report["arrival_interval_ms"] else ""
-        lines.append(f"  line     jitter {report['delay_jitter_ms']:.2f} ms{every}")
+    if report["arrival_interval_ms"] is not None:
+        jitter = "" if report["delay_jitter_ms"] is None else f", jitter {report['delay_jitter_ms']:.2f} ms"
+        lines.append(f"  line     arrivals every {report['arrival_interval_ms']:.1f} ms{jitter}")
     if report["latest"] is not None:
         _, gx, gy, gz, ax, ay, az = report["latest"]
         lines.append(f"  gyro     {math.degrees(gx):+9.3f} {math.degrees(gy):+9.3f} {math.degrees(gz):+9.3f} deg/s")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import http
+import socket
 from email.utils import formatdate
 
 from websockets.datastructures import Headers
@@ -23,6 +24,18 @@ def reachable(host: str) -> str:
     if host in ("", "0.0.0.0", "::"):
         return "127.0.0.1"
     return f"[{host}]" if ":" in host else host
+
+
+def own_address() -> str:
+    """This machine's address on its network, for another machine; 127.0.0.1 where it has none."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # Of a datagram socket this chooses the way out, and sends nothing.
+            probe.connect(("10.255.255.255", 1))
+        except OSError:
+            return "127.0.0.1"
+        address: str = probe.getsockname()[0]
+        return address
 
 
 def is_local(host: str) -> bool:

@@ -24,6 +24,8 @@ from imu.protocols import FORCE_LIMIT, RATE_LIMIT, TIME_LIMIT
 RATES = {"rad/s": 1.0, "deg/s": math.radians(1.0)}
 FORCES = {"m/s2": 1.0, "g": GRAVITY}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+# m/s: no robot indoors is as fast.
+SPEED_LIMIT = 100.0
 # s: the stamps of one message are nearer to each other, at any rate worth sending at.
 MESSAGE_SPAN = 60.0
 
@@ -64,6 +66,13 @@ class Imu(Struct, Generic[SampleT], frozen=True, tag_field="type", tag="imu"):
     samples: Annotated[list[SampleT], Meta(min_length=1, max_length=200)]
 
 
+class Wheels(Struct, Generic[SampleT], frozen=True, tag_field="type", tag="wheels"):
+    """[t, forward speed, yaw rate] each, t as in Imu, m/s and rad/s whatever the units of the IMU; null for one of the
+    two that the robot does not know."""
+
+    samples: Annotated[list[SampleT], Meta(min_length=1, max_length=200)]
+
+
 class ClockAnswer(Struct, frozen=True, tag_field="type", tag="clock"):
     """`received` and `sent`: when the question came and this answer left, by the robot's own clock."""
 
@@ -72,7 +81,8 @@ class ClockAnswer(Struct, frozen=True, tag_field="type", tag="clock"):
     sent: float
 
 
-FromRobot = Hello | Imu[Reading] | ClockAnswer
+WheelReading = tuple[float | None, float | None, float | None]
+FromRobot = Hello | Imu[Reading] | Wheels[WheelReading] | ClockAnswer
 
 
 class Watch(Struct, frozen=True, tag_field="type", tag="hello"):
@@ -138,14 +148,21 @@ FORMATS: dict[str, Callable[[Struct], bytes]] = {"json": encode, "msgpack": msgs
 
 
 @functools.cache
-def _decoders(rate: str, force: str, time: str) -> tuple[Any, Any]:
+def _decoders(gyro_unit: str, accel_unit: str, clock_unit: str) -> tuple[Any, Any]:
     """For text and for binary messages in these units. Ranges, and with them NaN, are checked while decoding."""
     gyro, accel, t = (
         Annotated[float, Meta(ge=-limit, le=limit)]
-        for limit in (RATE_LIMIT / RATES[rate], FORCE_LIMIT / FORCES[force], TIME_LIMIT / TIMES[time])
+        for limit in (
+            RATE_LIMIT / RATES[gyro_unit],
+            FORCE_LIMIT / FORCES[accel_unit],
+            TIME_LIMIT / TIMES[clock_unit],
+        )
     )
     sample: Any = tuple[t | None, gyro, gyro, gyro, accel, accel, accel]  # type: ignore[valid-type]
-    kinds: Any = Hello | Imu[sample] | ClockAnswer
+    speed = Annotated[float, Meta(ge=-SPEED_LIMIT, le=SPEED_LIMIT)]
+    rate = Annotated[float, Meta(ge=-RATE_LIMIT, le=RATE_LIMIT)]
+    reading: Any = tuple[t | None, speed | None, rate | None]  # type: ignore[valid-type]
+    kinds: Any = Hello | Imu[sample] | Wheels[reading] | ClockAnswer
     return msgspec.json.Decoder(kinds), msgspec.msgpack.Decoder(kinds)
 
 
@@ -168,7 +185,7 @@ class Dialect:
             message: FromRobot = text.decode(data) if isinstance(data, str) else binary.decode(data)
         except (msgspec.DecodeError, RecursionError) as error:
             raise MessageError(_explain(data, str(error), self)) from None
-        if isinstance(message, Imu):
+        if isinstance(message, Imu | Wheels):
             stamps = [sample[0] for sample in message.samples if sample[0] is not None]
             span = (max(stamps) - min(stamps)) * TIMES[self.clock.unit] if stamps else 0.0
             # A counter that wraps within the message is no error.
@@ -196,6 +213,13 @@ class Dialect:
             )
             for t, gx, gy, gz, ax, ay, az in message.samples
         ]
+
+    def wheels(self, message: Wheels[WheelReading]) -> list[WheelReading]:
+        """Its readings with stamps in s without wraps. Raises MessageError for one that says nothing."""
+        for i, (_, speed, yaw_rate) in enumerate(message.samples):
+            if speed is None and yaw_rate is None:
+                raise MessageError(f"sample {i}: neither speed nor yaw rate; needed: at least one of the two")
+        return [(None if t is None else self.seconds(t), speed, yaw_rate) for t, speed, yaw_rate in message.samples]
 
     def seconds(self, ticks: float) -> float:
         """A reading of the robot's clock in s, without its wraps: readings come less than half a wrap apart."""
@@ -238,12 +262,13 @@ _NEEDED = {
     ("hello", "units"): '{"gyro": "rad/s" or "deg/s", "accel": "m/s2" or "g"}',
     ("hello", "clock"): '{"unit": "s", "ms", "us" or "ns"}, and "wraps_at" where its counter begins again at 0',
     ("imu", "samples"): "a list of 1 to 200 samples [t, gx, gy, gz, ax, ay, az]",
+    ("wheels", "samples"): "a list of 1 to 200 samples [t, speed, yaw_rate]",
     ("clock", "id"): "the id of the question",
     ("clock", "received"): "when the question came, by the robot's clock",
     ("clock", "sent"): "when the answer left, by the robot's clock",
 }
 _TYPES = tuple(dict.fromkeys(kind for kind, _ in _NEEDED))
-_FIELDS = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+_FIELDS = {"imu": ("t", "gx", "gy", "gz", "ax", "ay", "az"), "wheels": ("t", "speed", "yaw_rate")}
 
 
 def _explain(data: str | bytes, what: str, dialect: Dialect) -> str:
@@ -275,24 +300,33 @@ def _explain(data: str | bytes, what: str, dialect: Dialect) -> str:
         value = value[key]
     name = str(path[0])
     if len(path) == 3 and name == "samples" and isinstance(path[2], int):
-        return f"sample {path[1]}, {_FIELDS[path[2]]}: found {_shown(value)}; needed: {_range(path[2], value, dialect)}"
+        field = _FIELDS[kind][path[2]]
+        return f"sample {path[1]}, {field}: found {_shown(value)}; needed: {_range(field, value, dialect)}"
     if len(path) == 2 and name == "samples":
-        return f"sample {path[1]}: found {_shown(value)}; needed: seven numbers [t, gx, gy, gz, ax, ay, az]"
+        return f"sample {path[1]}: found {_shown(value)}; needed: the numbers [{', '.join(_FIELDS[kind])}]"
     if name == "samples" and isinstance(value, list):
         return f"{len(value)} samples in one message; needed: 1 to 200"
     return f'"{".".join(map(str, path))}": found {_shown(value)}; needed: {_NEEDED[kind, name]}'
 
 
-def _range(field: int, value: object, dialect: Dialect) -> str:
+def _range(field: str, value: object, dialect: Dialect) -> str:
     """What a number of a sample must be; `value` is what it was."""
     units = dialect.units
-    if field == 0:
+    if field == "t":
         return f"{dialect.clock.unit} of the robot's own clock, or null where it has none"
-    unit, limit = (
-        (units.gyro, RATE_LIMIT / RATES[units.gyro]) if field < 4 else (units.accel, FORCE_LIMIT / FORCES[units.accel])
-    )
+    unit, limit = {
+        "g": (units.gyro, RATE_LIMIT / RATES[units.gyro]),
+        "a": (units.accel, FORCE_LIMIT / FORCES[units.accel]),
+        "s": ("m/s", SPEED_LIMIT),
+        "y": ("rad/s", RATE_LIMIT),
+    }[field[0]]
     right = f"{unit}, at most {limit:.6g}"
-    if unit == "rad/s" and isinstance(value, float | int) and limit < abs(value) <= math.degrees(limit):
+    if (
+        field[0] == "g"
+        and unit == "rad/s"
+        and isinstance(value, float | int)
+        and limit < abs(value) <= math.degrees(limit)
+    ):
         right += ' (degrees a second are told by "units": {"gyro": "deg/s"} in the hello)'
     return right
 

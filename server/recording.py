@@ -5,8 +5,9 @@
                 the body's origin along its axes, as `imu.mounting` says; without it imu.csv holds those
     fixes.csv   t_s,arrival_s,x,y,z,qw,qx,qy,qz  world_from_body at t_s; optional sigma_position,sigma_attitude
                 (m, rad), or what a camera knows more: misfit, source, markers (ids, with spaces between), cov_00 ...
-                cov_55 (upper triangle of the covariance as in `fusion.measurements`), and a second hypothesis with
-                the same columns headed alt_
+                cov_55 (upper triangle of the covariance as in `fusion.measurements`), sys_00 ... sys_55 (of its
+                systematic part), and a second hypothesis with the same columns headed alt_
+    wheels.csv  t_s,speed,yaw_rate,arrival_s      optional: m/s forward and rad/s to the left, empty where not known
     truth.csv   t_s,x,y,z,qw,qx,qy,qz            optional, never an input
     poses.tum   t x y z qx qy qz qw              what was published live, one line an IMU sample (TUM format)
 
@@ -27,16 +28,18 @@ from typing import Any, NamedTuple, TextIO
 import msgspec
 import numpy as np
 
-from fusion.measurements import Array, ImuBatch, MeasurementError, PoseFix, PoseHypothesis
+from fusion.measurements import Array, ImuBatch, MeasurementError, PoseFix, PoseHypothesis, WheelOdometry
 from fusion.params import FilterParams
 from imu.mounting import BodyReadings, ImuCalibration, toml_lines
 
 IMU_COLUMNS = ("t_s", "gx", "gy", "gz", "ax", "ay", "az")
+WHEEL_COLUMNS = ("t_s", "speed", "yaw_rate", "arrival_s")
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 TRUTH_COLUMNS = ("t_s", *POSE_COLUMNS)
 UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 COVARIANCE_COLUMNS = tuple(f"cov_{i}{j}" for i, j in UPPER)
-HYPOTHESIS_COLUMNS = (*POSE_COLUMNS, "misfit", *COVARIANCE_COLUMNS)
+SYSTEMATIC_COLUMNS = tuple(f"sys_{i}{j}" for i, j in UPPER)
+HYPOTHESIS_COLUMNS = (*POSE_COLUMNS, "misfit", *COVARIANCE_COLUMNS, *SYSTEMATIC_COLUMNS)
 FIX_COLUMNS = (
     "t_s",
     "arrival_s",
@@ -55,7 +58,7 @@ class Recording(NamedTuple):
     """What one robot's folder holds.
 
     `samples` (n, 7) as in `ImuBatch`, of the body, in order of arrival; `arrival` (n,) s; `fixes` in order of arrival;
-    `truth` (m, 8): t, position, quaternion wxyz, or None.
+    `truth` (m, 8): t, position, quaternion wxyz, or None. `wheels` in order of arrival.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Recording(NamedTuple):
     arrival: Array
     fixes: list[PoseFix]
     truth: Array | None
+    wheels: tuple[WheelOdometry, ...] = ()
 
 
 def robot_folders(folder: Path) -> list[Path]:
@@ -113,7 +117,34 @@ def load(folder: Path, params: FilterParams | None = None, calibration: ImuCalib
     fixes = _load_fixes(folder / "fixes.csv", params)
     if not fixes:
         raise RecordingError(f"{folder / 'fixes.csv'}: no fix after the header; without one there is no start")
-    return Recording(folder.resolve().name, to_body(np.ascontiguousarray(table[:, :7])), arrival, fixes, truth)
+    name, samples = folder.resolve().name, to_body(np.ascontiguousarray(table[:, :7]))
+    return Recording(name, samples, arrival, fixes, truth, _load_wheels(folder / "wheels.csv", name))
+
+
+def _load_wheels(path: Path, robot: str) -> tuple[WheelOdometry, ...]:
+    """Readings that arrived together are one."""
+    if not path.exists():
+        return ()
+    columns = [_header(path, WHEEL_COLUMNS).index(name) for name in WHEEL_COLUMNS]
+    rows: list[list[float]] = []
+    for line, row in _rows(path):
+        cells = [row[column] if column < len(row) else None for column in columns]
+        known = [
+            name in ("t_s", "arrival_s") or cell not in (None, "")
+            for name, cell in zip(WHEEL_COLUMNS, cells, strict=True)
+        ]
+        rows.append(
+            [
+                _number(path, line, name, cell) if there else math.nan
+                for name, cell, there in zip(WHEEL_COLUMNS, cells, known, strict=True)
+            ]
+        )
+        if not any(known[1:3]):
+            raise RecordingError(f"{path}, line {line}: neither speed nor yaw_rate; at least one of the two is needed")
+    table = np.array(rows).reshape(-1, len(WHEEL_COLUMNS))
+    _must_rise(path, "arrival_s", table[:, 3])
+    groups = np.split(table, np.flatnonzero(np.diff(table[:, 3])) + 1) if len(table) else []
+    return tuple(WheelOdometry(robot, float(group[0, 3]), group[:, :3]) for group in groups)
 
 
 def _open(path: Path) -> TextIO:
@@ -229,17 +260,18 @@ def _load_fixes(path: Path, params: FilterParams) -> list[PoseFix]:
 
 
 def _hypothesis(cells: dict[str, str], number: Any, head: str, params: FilterParams) -> PoseHypothesis:
-    covariance = np.zeros((6, 6))
-    if f"{head}cov_00" in cells:
-        for (i, j), name in zip(UPPER, COVARIANCE_COLUMNS, strict=True):
-            covariance[i, j] = covariance[j, i] = number(head + name)
-    else:
+    covariance, systematic = np.zeros((6, 6)), np.zeros((6, 6))
+    for matrix, names in ((covariance, COVARIANCE_COLUMNS), (systematic, SYSTEMATIC_COLUMNS)):
+        if head + names[0] in cells:
+            for (i, j), name in zip(UPPER, names, strict=True):
+                matrix[i, j] = matrix[j, i] = number(head + name)
+    if f"{head}cov_00" not in cells:
         position = number("sigma_position", 0.0) if "sigma_position" in cells else params.fix_position_sigma
         attitude = number("sigma_attitude", 0.0) if "sigma_attitude" in cells else params.fix_attitude_sigma
         np.fill_diagonal(covariance, [position**2] * 3 + [attitude**2] * 3)
     pose = [number(head + name) for name in POSE_COLUMNS]
     misfit = number(f"{head}misfit") if f"{head}misfit" in cells else 0.0
-    return PoseHypothesis(np.array(pose[:3]), np.array(pose[3:]), covariance, misfit)
+    return PoseHypothesis(np.array(pose[:3]), np.array(pose[3:]), covariance, misfit, systematic)
 
 
 def write_tum(path: Path, track: Array) -> None:
@@ -283,6 +315,14 @@ class Recorder:
         for row in batch.samples.tolist():
             self._write(batch.robot, "imu.csv", (*row, batch.arrival))
 
+    def wheels(self, odometry: WheelOdometry) -> None:
+        """Readings of the wheels."""
+        if (odometry.robot, "wheels.csv") not in self._files:
+            self._write(odometry.robot, "wheels.csv", WHEEL_COLUMNS)
+        for row in odometry.samples.tolist():
+            cells = ["" if math.isnan(value) else value for value in row]
+            self._write(odometry.robot, "wheels.csv", (*cells, odometry.arrival))
+
     def fix(self, fix: PoseFix) -> None:
         """A fix with all that it knows."""
         cells: list[Any] = [fix.t, fix.arrival]
@@ -291,7 +331,7 @@ class Recorder:
             if i == 1:
                 cells += origin
             cells += [*hypothesis.position, *hypothesis.quaternion_wxyz, hypothesis.misfit]
-            cells += [hypothesis.covariance[at] for at in UPPER]
+            cells += [matrix[at] for matrix in (hypothesis.covariance, hypothesis.systematic) for at in UPPER]
         if len(fix.hypotheses) == 1:
             cells += [*origin, *([""] * len(HYPOTHESIS_COLUMNS))]
         self._write(fix.robot, "fixes.csv", cells)

@@ -232,7 +232,13 @@ class RemoteCamera(Camera):
             for marker in sorted(seen.markers, key=lambda marker: marker.id)
         ]
         return SightedFrame(
-            to_host(seen.t) + offset, seen.sequence, seen.width_px, seen.height_px, sightings, seen.detect_ms
+            t=to_host(seen.t) + offset,
+            sequence=seen.sequence,
+            width_px=seen.width_px,
+            height_px=seen.height_px,
+            sightings=sightings,
+            detect_ms=seen.detect_ms,
+            repeated=self.ids.intersection(seen.repeated),
         )
 
     def delivery(self, now: float) -> Delivery | None:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from fusion.consistency import hold_last, track_error
 from fusion.health import Health
 from fusion.localiser import Localiser, warm_up
-from fusion.measurements import Array, FixOutcome, Outcome
+from fusion.measurements import Array, FixOutcome, Outcome, PoseFix, WheelOdometry
 from fusion.params import Channel, Engine, FilterParams, Motion
 from imu.mounting import ImuCalibration
 from server import config
@@ -60,7 +60,7 @@ def replay(
     health: Health | None = None,
     channel: Channel = "best",
 ) -> tuple[Array, list[FixOutcome], float]:
-    """Feed a recording to a localiser in order of arrival, a fix before a sample that arrives with it.
+    """Feed a recording to a localiser in order of arrival, a fix or the wheels before a sample that arrives with it.
 
     -> the causal track (n, 8), a row per IMU sample in order of arrival: its stamp, position, quaternion wxyz, NaN
     before the first fix; the fixes' outcomes; the seconds that the filter took. `progress` is called with the number of
@@ -68,7 +68,10 @@ def replay(
     """
     track = np.full((len(recording.samples), 8), np.nan)
     outcomes: list[FixOutcome] = []
-    stops = np.searchsorted(recording.arrival, [fix.arrival for fix in recording.fixes], side="left")
+    inputs: list[PoseFix | WheelOdometry] = sorted(
+        (*recording.fixes, *recording.wheels), key=lambda given: given.arrival
+    )
+    stops = np.searchsorted(recording.arrival, [given.arrival for given in inputs], side="left")
     at = 0
     took = 0.0
 
@@ -84,19 +87,21 @@ def replay(
             health.sampled(recording.samples[at:stop], track[at:stop])
 
     due = recording.arrival[0] + DIAGNOSE_EVERY
-    for fix, stop in zip(recording.fixes, stops, strict=True):
+    for given, stop in zip(inputs, stops, strict=True):
         if stop > at:
             feed_samples(int(stop))
             at = int(stop)
             if progress is not None:
                 progress(at)
-        if health is not None:
-            health.arrived(fix)
-            if fix.arrival >= due:
-                health.diagnoses(fix.arrival)
-                due = fix.arrival + DIAGNOSE_EVERY
+        if health is not None and isinstance(given, WheelOdometry):
+            health.wheels(given)
+        if health is not None and isinstance(given, PoseFix):
+            health.arrived(given)
+            if given.arrival >= due:
+                health.diagnoses(given.arrival)
+                due = given.arrival + DIAGNOSE_EVERY
         began = time.perf_counter()
-        judged = localiser.feed(fix)
+        judged = localiser.feed(given)
         took += time.perf_counter() - began
         outcomes += judged
         if health is not None:

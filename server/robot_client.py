@@ -19,7 +19,7 @@ import ssl
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from types import TracebackType
-from typing import Literal, cast
+from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
 import msgspec
@@ -40,6 +40,8 @@ from server.messages import (
     ToRobot,
     Units,
     Welcome,
+    WheelReading,
+    Wheels,
 )
 
 log = logging.getLogger("steadfix.robot")
@@ -152,10 +154,19 @@ class Robot:
         5 to 10 at a time are best. False if there is no connection at present: the samples are dropped, since those of
         some seconds ago are of no use to anybody.
         """
+        rows = [tuple(map(float, sample)) for sample in samples]
+        return await self._send_all(rows, lambda part: Imu(cast(list[Reading], part)))
+
+    async def send_wheels(self, samples: Iterable[Sequence[float | None]]) -> bool:
+        """Send readings of the wheels (t, forward speed, yaw rate), oldest first: s of the robot's clock, m/s, rad/s;
+        None for one of the two that it does not know. Otherwise as `send`."""
+        rows = [tuple(None if value is None else float(value) for value in sample) for sample in samples]
+        return await self._send_all(rows, lambda part: Wheels(cast(list[WheelReading], part)))
+
+    async def _send_all(self, rows: Sequence[Any], message: Callable[[Any], msgspec.Struct]) -> bool:
         # Their length is for the service to check: it answers a wrong one with an error in words.
-        rows = cast(list[Reading], [tuple(map(float, sample)) for sample in samples])
         for i in range(0, len(rows), BATCH):
-            if not await self._send(Imu(rows[i : i + BATCH])):
+            if not await self._send(message(rows[i : i + BATCH])):
                 self.dropped += len(rows) - i
                 return False
         return True

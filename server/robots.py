@@ -13,13 +13,13 @@ import numpy as np
 from fusion.diagnosis import Diagnosis
 from fusion.health import Health
 from fusion.localiser import Localiser
-from fusion.measurements import Array, ImuBatch, Pose, PoseFix
+from fusion.measurements import Array, ImuBatch, Pose, PoseFix, WheelOdometry
 from imu.clock import DeviceClock, Reading
 from imu.health import StreamHealth
 from imu.mounting import BodyReadings
 from imu.protocols import Parser
 from server.config import RobotConfig
-from server.messages import Dialect, PoseMessage, pose_message
+from server.messages import Dialect, PoseMessage, WheelReading, pose_message
 
 # Seconds over which the rate of the IMU is counted.
 RATE_WINDOW = 2.0
@@ -36,6 +36,7 @@ class Recording(Protocol):
 
     def imu(self, batch: ImuBatch) -> None: ...
     def fix(self, fix: PoseFix) -> None: ...
+    def wheels(self, odometry: WheelOdometry) -> None: ...
     def track(self, robot: str, track: Array) -> None: ...
 
 
@@ -92,6 +93,21 @@ class Robot:
         if self._recording is not None:
             self._recording.track(self.config.name, track)
 
+    def feed_wheels(self, readings: Sequence[WheelReading], arrival: float) -> None:
+        """Readings of the wheels that reached the service together, stamped by the clock that stamps the IMU.
+
+        Those without a stamp, or that come before the IMU's first, count as taken at `arrival`.
+        """
+        rows = np.array(readings, dtype=np.float64)
+        for row in rows:
+            t = self.clock.to_host(float(row[0]))
+            row[0] = min(t, arrival) if math.isfinite(t) else arrival
+        odometry = WheelOdometry(self.config.name, arrival, rows)
+        if self._recording is not None:
+            self._recording.wheels(odometry)
+        self.vitals.judged(self.localiser.feed(odometry))
+        self.vitals.wheels(odometry)
+
     def feed_fix(self, fix: PoseFix, now: float) -> None:
         """A fix, which counts as arrived now."""
         fix = replace(fix, arrival=now)
@@ -130,8 +146,9 @@ class Robot:
         """Bring `diagnoses` up to date. -> what is new, for the log: each once when it comes and when it goes."""
         self.diagnoses = self.vitals.diagnoses(now)
         said = {diagnosis.code for diagnosis in self.diagnoses}
-        # What needs no fixes to be seen.
-        for diagnosis in (Diagnosis(*finding) for finding in self.stream.findings() if finding.code not in said):
+        # What needs no fixes to be seen, of an IMU that is not long gone.
+        findings = self.stream.findings() if now - self.heard < GONE_AFTER else []
+        for diagnosis in (Diagnosis(*finding) for finding in findings if finding.code not in said):
             since, *_ = self.vitals.said.get(diagnosis.key, (now,))
             self.vitals.said[diagnosis.key] = since, now, diagnosis
             self.diagnoses.append(diagnosis)

@@ -144,6 +144,8 @@ def describe(data: bytes) -> str:
         what = f"text of no known form, such as {line[:80].decode(errors='replace')!r}"
         if line.count(b",") >= 5:
             what += '; its columns have to be named, such as "t[us],gx[deg/s],gy[deg/s],gz[deg/s],ax[g],ay[g],az[g]"'
+        if line.startswith(b"{"):
+            what += '; as JSON it needs "gyro": [x, y, z] and "accel": [x, y, z], of finite numbers'
         return what
     if data.count(data[:1]) == len(data):
         return f"nothing but the byte {data[0]:#04x}: a wrong baud rate, or a line that hangs"

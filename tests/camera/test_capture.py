@@ -211,6 +211,7 @@ class Webcam:
         self.there = True
 
     def __call__(self, source, backend):
+        self.opened = source, backend
         return self
 
     def isOpened(self):
@@ -281,8 +282,9 @@ def test_a_usb_camera_that_does_not_take_its_exposure_says_so(monkeypatch, caplo
 def test_a_usb_camera_is_left_alone_where_nothing_is_asked(monkeypatch):
     webcam = Webcam()
     monkeypatch.setattr(cv2, "VideoCapture", webcam)
-    V4l2Device(0)
+    V4l2Device("/dev/null")
     assert webcam.set_in_order == []
+    assert webcam.opened == ("/dev/null", cv2.CAP_V4L2)
 
 
 def test_a_network_camera_is_stamped_by_its_own_clock_and_missed_when_it_hangs_up():

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from camera import fix, planar
-from camera.fix import Body, MarkerMount, MarkerPose, View, marker_corners, marker_poses, project, rays, solve
+from camera.fix import Body, MarkerMount, MarkerPose, View, marker_corners, marker_poses, predict, project, rays, solve
 from camera.markers import MarkerSighting
-from fusion.geometry import exp_so3, rotation_about_z, transform, transform_points
+from fusion.geometry import exp_so3, quaternion_from_rotation, rotation_about_z, transform, transform_points
+from fusion.measurements import Mode, Pose
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA, moved, nees, pose_error, sight
 
 SIGMA_PX = 0.1
@@ -170,3 +171,56 @@ def test_a_camera_believed_elsewhere_moves_the_fix_with_it():
     believed = transform(np.eye(3), [0.003, 0.0, 0.0]) @ WORLD_FROM_CAMERA
     found = solve([Body("r", ONE, planar=True)], sightings, INTRINSICS, believed, arrival=1.1)[0].hypotheses[0]
     np.testing.assert_allclose(found.position, truth[:3, 3] + [0.003, 0.0, 0.0], atol=1e-5)
+
+
+def known_at(world_from_body, covariance=None, velocity=(0.0, 0.0, 0.0)):
+    return Pose(
+        "rover", 1.0, world_from_body[:3, 3], quaternion_from_rotation(world_from_body[:3, :3]), np.array(velocity),
+        np.array([0.0, 0.0, 0.5]), np.diag([1e-4] * 3 + [1e-4] * 3) if covariance is None else covariance,
+        np.eye(3), Mode.FULL, 0, 0.0,
+    )  # fmt: skip
+
+
+def test_markers_are_predicted_where_they_are_seen_as_far_as_the_pose_is_known():
+    random, body = np.random.default_rng(11), Body("rover", TWO, planar=True)
+    truth = on_the_floor(random)
+    seen = {s.id: s.corners_px for s in sight(TWO, truth, random, 0.0)}
+    predicted = predict([body], {"rover": known_at(truth)}, INTRINSICS, WORLD_FROM_CAMERA)
+    assert predicted.keys() == seen.keys()
+    for id, prediction in predicted.items():
+        np.testing.assert_allclose(prediction.corners_px, seen[id], atol=1e-6)
+    off = []
+    for _ in range(200):
+        shift = random.normal(0.0, 0.01, 6)
+        off += [
+            (s.corners_px - predicted[s.id].corners_px) / predicted[s.id].sigma_px
+            for s in sight(TWO, moved(truth, shift), random, 0.0)
+        ]
+    # A bound that is not far away
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.0
+
+
+def test_a_rolling_shutter_sees_what_moves_where_it_is_in_that_row():
+    body, truth, velocity = Body("rover", ONE, planar=True), transform(np.eye(3), [0.3, 0.2, 0.0]), [1.0, -0.5, 0.0]
+    line_time = 40e-6
+    (prediction,) = predict(
+        [body], {"rover": known_at(truth, velocity=velocity)}, INTRINSICS, WORLD_FROM_CAMERA, line_time
+    ).values()
+    later = line_time * prediction.corners_px[:, 1].mean()
+    there = transform(rotation_about_z(0.5 * later), truth[:3, 3] + later * np.array(velocity))
+    (seen,) = sight(ONE, there, np.random.default_rng(0), 0.0)
+    np.testing.assert_allclose(prediction.corners_px, seen.corners_px, atol=0.02)
+
+
+def test_what_cannot_be_seen_is_predicted_out_of_the_picture_and_what_is_lost_not_at_all():
+    truth = transform(np.eye(3), [0.3, 0.2, 0.0])
+    below = [MarkerMount(7, 0.1, transform(exp_so3([np.pi, 0.0, 0.0]), [0.0, 0.0, -0.1]))]
+    for mounts, pose in ((below, truth), (ONE, transform(np.eye(3), [0.0, 0.0, 9.0]))):
+        (prediction,) = predict(
+            [Body("rover", mounts, planar=True)], {"rover": known_at(pose)}, INTRINSICS, WORLD_FROM_CAMERA
+        ).values()
+        assert prediction.corners_px.max() < -1e5
+    for covariance in (np.diag([4.0, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]), np.full((6, 6), np.inf)):
+        poses = {"rover": known_at(truth, covariance)}
+        assert predict([Body("rover", ONE, planar=True)], poses, INTRINSICS, WORLD_FROM_CAMERA) == {}
+    assert predict([Body("cart", ONE, planar=True)], {"rover": known_at(truth)}, INTRINSICS, WORLD_FROM_CAMERA) == {}

@@ -163,7 +163,7 @@ def test_a_survey_is_as_good_as_it_says_in_the_air_and_on_the_floor(count, tapes
     world = np.hstack([places, np.zeros((3, 1))])
     seen_at = project(transform_points(inverse(WORLD_FROM_CAMERA), world), INTRINSICS)[0]
     distances, normalised = [], []
-    for _ in range(40):
+    for _ in range(24):
         sightings, believed, measured, _ = room(random, count, tapes)
         found = survey(sightings, believed, {"ceiling": INTRINSICS}, measured).placements["ceiling"]
         camera = found.world_from_camera[:3, 3]
@@ -172,8 +172,8 @@ def test_a_survey_is_as_good_as_it_says_in_the_air_and_on_the_floor(count, tapes
         directions = rays(seen_at, INTRINSICS) @ found.world_from_camera[:3, :3].T
         hit = camera - (camera[2] / directions[:, 2])[:, None] * directions
         normalised.append(np.linalg.norm((hit - world)[:, :2], axis=1) / floor_sigma(found, INTRINSICS, places))
-    # The mean of 40 values of chi-square at 6 degrees of freedom: 6 +- 3 sigma of 0.55.
-    assert 4.4 < np.mean(distances) < 7.6
+    # The mean of 24 values of chi-square at 6 degrees of freedom: 6 +- 3 sigma of 0.71.
+    assert 3.9 < np.mean(distances) < 8.1
     assert 0.7 < np.sqrt(np.mean(np.square(normalised))) < 1.3
 
 
@@ -212,13 +212,16 @@ def test_a_tape_that_contradicts_the_others_is_named():
     for error, refused in ((0.02, False), (0.3, True)):
         wrong = [*measured]
         wrong[k] = replace(measured[k], length=measured[k].length + error)
-        words = rf"tape 41-43 says {1e3 * wrong[k].length:.0f} mm, everything else \d+ mm"
         if refused:
-            with pytest.raises(PlacementError, match=words):
+            with pytest.raises(PlacementError) as caught:
                 survey(sightings, believed, {"ceiling": INTRINSICS}, wrong)
+            words = str(caught.value)
         else:
-            (doubt,) = survey(sightings, believed, {"ceiling": INTRINSICS}, wrong).doubts
-            assert re.match(words, doubt)
+            (words,) = survey(sightings, believed, {"ceiling": INTRINSICS}, wrong).doubts
+        said = re.match(r"tape 41-43 says (\d+) mm, everything else (\d+) mm", words)
+        assert said is not None
+        assert int(said[1]) == round(1e3 * wrong[k].length)
+        assert int(said[2]) == pytest.approx(1e3 * measured[k].length, abs=12.0)
 
 
 def test_an_anchor_that_is_centimetres_off_is_doubted_by_name():

@@ -97,6 +97,24 @@ def test_a_board_that_is_moved_or_stays_where_it_was_is_not_taken():
     assert len(guide.views) == 1
 
 
+def test_a_quarter_turn_is_shown_as_one():
+    """Where all else is there, views are wanted of the turned board: its top left corner at the picture's right."""
+    person, guide = Person("charuco:8x6:30mm"), Guide(parse_board("charuco:8x6:30mm"))
+    target = MIDDLE
+    for _ in range(60):
+        pose = person.hold(target)
+        guide.feed(person.view(pose))
+        step = guide.feed(person.view(pose))
+        if step.text.startswith("Turn the board by a quarter"):
+            break
+        target = target if step.target_px is None else step.target_px
+    left_top, right_top, _, left_bottom = step.target_px
+    across, down = right_top - left_top, left_bottom - left_top
+    assert abs(across[0]) < 1e-9 < across[1]
+    assert down[0] < 0.0
+    assert abs(across[1] / down[0]) == pytest.approx(8 / 6)
+
+
 def test_no_board_and_a_board_that_goes_away():
     person, guide = Person("charuco:8x6:30mm"), Guide(parse_board("charuco:8x6:30mm"))
     assert guide.feed(None).text == "Hold the board into the picture"
@@ -116,8 +134,17 @@ def test_a_board_that_only_faces_the_camera_never_gets_there():
         guide.feed(person.view(pose))
     assert len(guide.views) >= 20
     assert {c.name for c in guide.criteria if not c.met} >= {"tilt", "focal"}
-    text = guide.feed(person.view(pose)).text
-    assert text.startswith(("Tilt the board", "Move the board", "Further"))
+    step = guide.feed(person.view(pose))
+    assert step.text.startswith(("Tilt the board", "Move the board", "Further"))
+    # What it draws stays in the picture though nobody knows the focal length.
+    assert np.abs(step.outline_px - (320.0, 240.0)).max() < 640.0
+    # Once the board is tilted, it is.
+    for k in range(16):
+        view = person.view(studio.held((0.3 + 0.1 * (k % 4), 0.3 + 0.1 * (k // 4)), 0.42, 30.0, 70.0 * k))
+        guide.feed(view)
+        guide.feed(view)
+    assert "tilt" not in {c.name for c in guide.criteria if not c.met}
+    assert "focal" not in {c.name for c in guide.criteria if not c.met}
 
 
 def test_a_camera_that_changes_its_size_is_refused():

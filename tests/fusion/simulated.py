@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fusion.consistency import TrackError, hold_last, interpolate, nees, rms, track_error
 from fusion.localiser import Localiser
-from fusion.measurements import Array, FixOutcome
+from fusion.measurements import Array, FixOutcome, WheelOdometry
 from fusion.params import FilterParams, Motion
 from fusion.simulator import Simulation
 
@@ -51,14 +51,20 @@ class Drive:
 
 
 def drive(simulation: Simulation, params: FilterParams | None = None, motion: Motion = "ground") -> Drive:
-    """Feed a simulation in order of arrival."""
+    """Feed a simulation in order of arrival; of the wheels, ten readings come together with the last of them."""
     localiser = Localiser("robot", params, motion)
     track = np.full((len(simulation.samples), 8), np.nan)
     times, errors, covariances, outcomes = [], [], [], []
     at = 0
-    for fix in simulation.fixes:
-        stop = int(np.searchsorted(simulation.arrival, fix.arrival))
+    groups = [simulation.wheels[i : i + 10] for i in range(0, len(simulation.wheels), 10)]
+    wheels = [WheelOdometry("robot", float(group[-1, 0]), group) for group in groups]
+    for given in sorted((*simulation.fixes, *wheels), key=lambda given: given.arrival):
+        stop = int(np.searchsorted(simulation.arrival, given.arrival))
         localiser.feed_samples(simulation.samples[at:stop], track[at:stop])
+        at = stop
+        if isinstance(given, WheelOdometry):
+            outcomes += localiser.judged() + localiser.feed(given)
+            continue
         pose = localiser.latest
         # With stamps that jump it may be of an instant that the truth does not cover.
         if pose is not None and simulation.truth[0, 0] <= pose.t <= simulation.truth[-1, 0]:
@@ -67,8 +73,7 @@ def drive(simulation: Simulation, params: FilterParams | None = None, motion: Mo
             errors.append(np.append(truth[1:4] - pose.position, (true_attitude * attitude.inv()).as_rotvec()))
             times.append(pose.t)
             covariances.append(pose.covariance)
-        outcomes += localiser.judged() + localiser.feed(fix)
-        at = stop
+        outcomes += localiser.judged() + localiser.feed(given)
     localiser.feed_samples(simulation.samples[at:], track[at:])
     outcomes += localiser.judged()
     return Drive(simulation, localiser, track, np.array(times), np.array(errors), np.array(covariances), outcomes)

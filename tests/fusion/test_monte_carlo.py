@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 import tracemalloc
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from fusion import kernels as k
-from fusion.consistency import attitude_angle, interpolate, nees, rms, track_error
+from fusion.consistency import nees, rms, track_error
 from fusion.localiser import Localiser
 from fusion.measurements import Array
 from fusion.params import FilterParams, Motion
@@ -22,6 +21,8 @@ from fusion.simulator import CameraParams, Simulation, aggressive, figure_eight,
 from tests.fusion.simulated import drive, held_mm
 
 RUNS = 100
+# The simulated fixes' errors do not repeat while the robot stands.
+MATCHED = FilterParams(fix_correlation=0.0)
 # s: until then the start is judged, apart from the rest.
 START = 5.0
 
@@ -59,24 +60,13 @@ class Report(NamedTuple):
     worst: float
 
 
-def from_a_good_fix(simulation: Simulation) -> Simulation:
-    """Without the fixes before the first one whose likelier pose is the right one."""
-    truth = interpolate(simulation.truth, np.array([fix.t for fix in simulation.fixes]))[:, 4:]
-    likelier = np.array([fix.hypotheses[0].quaternion_wxyz for fix in simulation.fixes])
-    other = np.array([fix.hypotheses[-1].quaternion_wxyz for fix in simulation.fixes])
-    good = attitude_angle(likelier, truth) < attitude_angle(other, truth)
-    return replace(simulation, fixes=simulation.fixes[int(np.argmax(good)) :])
-
-
-def monte_carlo(motion: Motion, flips: bool, good_start: bool = False) -> Report:
+def monte_carlo(motion: Motion, flips: bool) -> Report:
     values: list[Array] = []
     starts: list[Array] = []
     squares, variances, mm, deg, worst = [], [], [], [], 0.0
     for seed in range(RUNS):
         simulation = random_drive(seed, motion, flips)
-        if good_start:
-            simulation = from_a_good_fix(simulation)
-        run = drive(simulation, None, motion)
+        run = drive(simulation, MATCHED, motion)
         late = run.times >= START
         value = nees(run.errors, run.covariances) / 6.0
         starts.append(value[~late])
@@ -110,54 +100,17 @@ def show(capsys: pytest.CaptureFixture[str], title: str, report: Report) -> None
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("motion", "anees", "ratio"),
-    [
-        # Measured: ANEES 0.911 (at rest it is too modest), position 0.975, attitude 1.050.
-        ("free", (0.90, 1.07), 1.06),
-        # 0.845, 0.991, 1.054. On the floor it is too modest: the constraints say less than is true here.
-        ("ground", (0.80, 1.07), 1.07),
-        # 0.736, 0.879, 1.017.
-        ("differential", (0.70, 1.07), 1.05),
-    ],
-)
-def test_it_is_as_good_as_it_says(motion, anees, ratio, capsys):
-    report = monte_carlo(motion, flips=False)
-    show(capsys, motion, report)
-    assert anees[0] < report.anees < anees[1]
-    assert max(report.position, report.attitude) < ratio
-    assert report.worst < 0.4
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("motion", "anees", "ratio"),
-    [
-        # Measured: ANEES 0.938, position 1.209, attitude 1.374.
-        ("free", (0.90, 1.07), 1.5),
-        # 0.856, 1.017, 1.101.
-        ("ground", (0.80, 1.07), 1.12),
-        # 0.728, 0.904, 1.018.
-        ("differential", (0.70, 1.07), 1.05),
-    ],
-)
-def test_it_is_as_good_as_it_says_with_flips_but_for_the_first_fix(motion, anees, ratio, capsys):
-    report = monte_carlo(motion, flips=True, good_start=True)
-    show(capsys, f"{motion} with flips from a good fix", report)
-    assert anees[0] < report.anees < anees[1]
-    assert max(report.position, report.attitude) < ratio
-    assert report.worst < 0.8
-
-
-@pytest.mark.long
+@pytest.mark.parametrize("flips", [False, True])
 @pytest.mark.parametrize("motion", ["free", "ground", "differential"])
-def test_it_is_as_good_as_it_says_with_flips(motion, capsys):
-    """The median run. The mean is spoilt by the runs whose first fix is a flipped one: ANEES of the first 5 s 29, 13
-    and 13, position RMSE over own sigma 3.16, 1.24 and 1.11 after it, worst run 6, 11 and 16 times that of holding."""
-    report = monte_carlo(motion, flips=True)
-    show(capsys, f"{motion} with flips", report)
-    assert {"free": 0.85, "ground": 0.78, "differential": 0.66}[motion] < report.median < 1.07
-    assert report.worst < 20.0
+def test_it_is_as_good_as_it_says(motion, flips, capsys):
+    report = monte_carlo(motion, flips)
+    show(capsys, f"{motion} with flips" if flips else motion, report)
+    assert 0.93 < report.anees < 1.07
+    # Attitude: a little above the 1.05 that is asked for. One drive of the hundred with flips starts in free flight so
+    # wrongly that it is seconds before it finds back.
+    assert report.position < (2.0 if flips and motion == "free" else 1.05)
+    assert report.attitude < 1.08
+    assert report.worst < (2.0 if flips else 0.4)
 
 
 @pytest.mark.long

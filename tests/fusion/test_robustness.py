@@ -29,7 +29,7 @@ from fusion.simulator import (
     simulate,
 )
 from fusion.tuning import scale_fix_noise
-from tests.fusion.simulated import drive, held_mm
+from tests.fusion.simulated import Drive, drive, held_mm
 
 SETTLED = 15.0  # s
 GYRO, ACCEL, FIX = (0.05, 1.0, 30.0), (0.05, 1.0, 30.0), (0.1, 1.0, 10.0)
@@ -91,11 +91,8 @@ def test_wrong_noise_settings_on_many_drives(motion, capsys):
     assert max(shares.values()) < 2.2
 
 
-@pytest.mark.xfail(
-    strict=True, reason="at rest, zero velocity makes a tilt of the acceleration; the speed does not rise"
-)
 def test_departure_is_noticed_although_the_gyro_noise_is_overstated():
-    """The robot leaves straight on at 15 s, and is held to be at rest until 15.65 s, when it does 0.5 m/s."""
+    """The robot leaves straight on at 15 s: what pushes it is felt before the gyroscope says anything."""
     simulation = simulate(random_ground(1), 1, 20.0)
     outcomes = drive(simulation, FilterParams(gyro_noise=0.03)).outcomes
     assert Outcome.REJECTED not in {outcome.outcome for outcome in outcomes}
@@ -179,6 +176,11 @@ def position_only(pose: PoseHypothesis) -> PoseHypothesis:
     return PoseHypothesis(pose.position, np.array([1.0, 0.0, 0.0, 0.0]), covariance)
 
 
+def believed(run: Drive) -> int:
+    """One in a thousand is beyond the gate by chance, and taken with less weight."""
+    return run.localiser.counts["accepted"] + run.localiser.counts["inflated"]
+
+
 def some(
     simulation: Simulation, change: Callable[[PoseHypothesis], PoseHypothesis], first: int, end: int
 ) -> Simulation:
@@ -191,7 +193,7 @@ def test_fixes_of_position_and_yaw_alone(motion):
     for seed in range(3):
         simulation = simulate(random_ground(seed), seed, 45.0)
         run = drive(each_pose(simulation, position_and_yaw), None, motion)
-        assert run.localiser.counts["accepted"] == len(simulation.fixes) - 1
+        assert believed(run) == len(simulation.fixes) - 1
         assert run.mm(SETTLED) < 1.2 * drive(simulation, None, motion).mm(SETTLED)
         assert run.deg(SETTLED) < 1.2
 
@@ -201,7 +203,7 @@ def test_fixes_of_position_alone_after_a_start_with_attitude(motion):
     for seed in range(3):
         simulation = simulate(course(motion, seed), seed, 45.0)
         run = drive(some(simulation, position_only, 5, 999), None, motion)
-        assert run.localiser.counts["accepted"] == len(simulation.fixes) - 1
+        assert believed(run) == len(simulation.fixes) - 1
         assert run.mm(SETTLED) < 1.5 * drive(simulation, None, motion).mm(SETTLED)
         assert run.deg(SETTLED) < 3.5
 
@@ -211,7 +213,7 @@ def test_fixes_of_position_alone_from_the_start():
     for seed in range(5):
         simulation = simulate(random_ground(seed), seed, 60.0)
         run = drive(each_pose(simulation, position_only))
-        assert run.localiser.counts["accepted"] == len(simulation.fixes) - 1
+        assert believed(run) == len(simulation.fixes) - 1
         assert run.mm(SETTLED) < 30.0
         assert run.deg(40.0) < 3.5
 
@@ -293,9 +295,6 @@ def test_a_gyro_that_saturates_now_and_then(motion):
         assert run.deg(SETTLED) < 2.5
 
 
-@pytest.mark.xfail(
-    strict=True, reason="saturation is not seen: 91 of 119 fixes are rejected, 2.3 m against 0.29 m held"
-)
 def test_a_gyro_that_saturates_often():
     """In 11 % of the samples."""
     simulation = weak_gyro(2)

@@ -103,14 +103,23 @@ def test_the_same_however_the_bytes_are_split(protocol: ProtocolName, cuts: list
 
 
 @every
-@given(noise=st.lists(st.binary(min_size=1, max_size=60), min_size=3, max_size=3), split=st.integers(1, 200))
+@given(
+    noise=st.lists(st.binary(max_size=60), min_size=3, max_size=3),
+    halves=st.lists(st.tuples(st.integers(0, 15), st.integers(1, 40)), min_size=3, max_size=3),
+    split=st.integers(1, 200),
+)
 @settings(max_examples=30, deadline=None)
-def test_garbage_costs_at_most_the_frames_it_touches(protocol: ProtocolName, noise: list[bytes], split: int) -> None:
-    """Four samples, noise, four samples, noise, ...: of each four only the first may be lost (derived rates: two)."""
+def test_garbage_costs_at_most_the_frames_it_touches(
+    protocol: ProtocolName, noise: list[bytes], halves: list[tuple[int, int]], split: int
+) -> None:
+    """Four samples, noise and half a frame, four samples, ...: of each four only the first may be lost (derived
+    rates: two)."""
     sent = wire(protocol)
-    # Long enough a tail for whatever length the noise claims to have.
-    tail = wire(protocol, rocking(3.0))
-    stream = b"\n" + b"".join(b"".join(sent[4 * i : 4 * i + 4]) + rubbish for i, rubbish in enumerate(noise))
+    # Long enough a tail for whatever length the noise claims to have, of samples that are none of those sent.
+    tail = wire(protocol, [sample._replace(ax=1.0) for sample in rocking(3.0, begin=100.0)])
+    # Half a frame claims to be a whole one.
+    rubbish = [random + sent[i][:-1][:size] for random, (i, size) in zip(noise, halves, strict=True)]
+    stream = b"\n" + b"".join(b"".join(sent[4 * i : 4 * i + 4]) + rubbish[i] for i in range(3))
     stream += b"".join(sent[12:16]) + b"".join(tail)
     parser = open_parser(protocol)
     samples = [sample for i in range(0, len(stream), split) for sample in parser.feed(stream[i : i + split])]

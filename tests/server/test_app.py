@@ -21,10 +21,11 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from camera.calibration import CalibrationError, Intrinsics, save_intrinsics
-from fusion.measurements import Array, ImuBatch, Pose, PoseFix
+from fusion.measurements import Array, ImuBatch, Pose, PoseFix, WheelOdometry
 from imu.protocols import RawSample
 from server.app import Service
 from server.config import CameraConfig, Config, ConfigError, parse
+from server.robot_client import Robot
 from tests.imu.streams import rvc_frame, steadfix_frame
 from tests.server.room import (
     CAMERA,
@@ -252,8 +253,9 @@ class Recording:
     def __init__(self) -> None:
         self.batches: list[ImuBatch] = []
         self.fixes: list[PoseFix] = []
+        self.odometry: list[WheelOdometry] = []
         self.tracks: list[Array] = []
-        self.imu, self.fix = self.batches.append, self.fixes.append
+        self.imu, self.fix, self.wheels = self.batches.append, self.fixes.append, self.odometry.append
 
     def track(self, robot: str, track: Array) -> None:
         self.tracks.append(track)
@@ -799,5 +801,32 @@ def test_a_robot_that_comes_back_with_another_imu_is_not_judged_by_the_first() -
                 found = {diagnosis.code for diagnosis in robot.diagnoses}
                 assert found & {"accel_unit", "imu_missing", "imu_stamps_repeat"} == wrong
                 now += 20.0  # nobody is there meanwhile
+
+    run(main)
+
+
+def test_a_robot_tells_how_its_wheels_turn() -> None:
+    async def main() -> None:
+        recording = Recording()
+        async with (
+            serving(recording=recording) as service,
+            Robot(f"ws://127.0.0.1:{service.port}", "rover", clock=lambda: time.monotonic() + 500.0) as robot,
+        ):
+            rover = service.robots["rover"]
+            # Without a stamp they count from their arrival.
+            assert await robot.send_wheels([(None, 0.5, None)])
+            await until(lambda: len(recording.odometry) == 1)
+            assert recording.odometry[0].samples[0, 0] == recording.odometry[0].arrival
+            assert await robot.send([(robot.clock(), 0.0, 0.0, 0.0, 0.0, 0.0, 9.80665)])
+            await until(lambda: rover.localiser.counts["imu_samples"] == 1)
+            now = robot.clock()
+            assert await robot.send_wheels([(now - 0.1, 0.5, 0.1), (now, None, 0.2)])
+            await until(lambda: len(recording.odometry) == 2)
+            samples = recording.odometry[1].samples
+            assert samples[:, 0] == pytest.approx([now - 500.1, now - 500.0], abs=0.5)
+            assert samples[1, 0] - samples[0, 0] == pytest.approx(0.1, abs=1e-3)
+            assert (samples[:, 0] <= recording.odometry[1].arrival).all()
+            np.testing.assert_array_equal(samples[:, 1:], [[0.5, 0.1], [np.nan, 0.2]])
+            assert service.refused == 0
 
     run(main)

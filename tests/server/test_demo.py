@@ -260,7 +260,7 @@ def test_the_remote_camera_is_killed_and_comes_back(monkeypatch: pytest.MonkeyPa
                         while not what():
                             await asyncio.sleep(0.01)
 
-                await until(lambda: all(score.count >= 80 for score in room._scores.values()))
+                await until(lambda: all(score.count >= 150 for score in room._scores.values()))
                 errors.update(
                     {name: math.sqrt(score.position_squares / score.count) for name, score in room._scores.items()}
                 )
@@ -277,8 +277,9 @@ def test_the_remote_camera_is_killed_and_comes_back(monkeypatch: pytest.MonkeyPa
 
     children = CHILDREN.read_text()
     asyncio.run(test())
-    # As long as the camera was there; without it the robots drift as they have learnt little of their IMUs yet.
-    assert max(errors.values()) < 0.05
+    # As long as the camera was there; without it the robots drift, as they have learnt little of their IMUs yet. Stamps
+    # of the wrong clock would put them metres away, or nowhere.
+    assert max(errors.values()) < 0.1
     assert CHILDREN.read_text() == children
 
 

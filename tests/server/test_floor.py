@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from camera.calibration import Intrinsics, save_intrinsics
-from camera.floor import load_placement
+from camera.floor import Placement, load_placement, save_placement
 from camera.synthetic import Room, straight_down
 from fusion.geometry import exp_so3, rotation_about_z, transform
 from server import cli
+from server.cameras import PLACEMENT_FRAMES, Camera
 from server.config import parse
 from tests.server.room import CONFIG, INTRINSICS, Ceiling, run, serving, until
 
@@ -233,6 +234,30 @@ def test_the_service_uses_what_was_written_where_no_anchor_is_in_view(
             pose = service.robots["rover"].localiser.pose_at(service.cameras["ceiling"].last_frame)
             assert pose is not None
             np.testing.assert_allclose(pose.position[:2], Ceiling.WORLD_FROM_BODY[:2, 3], atol=0.03)
+
+    run(main)
+
+
+def test_a_placement_is_kept_while_the_anchors_in_view_agree(tmp_path: Path) -> None:
+    save_intrinsics(tmp_path / "camera.toml", INTRINSICS)
+    camera = '[[camera]]\nname = "ceiling"\nsource = 0\ncalibration = "camera.toml"\nplacement = "there.toml"\n'
+    anchors = "".join(
+        f"[[anchor]]\nid = {id}\nsize_mm = 180\nposition_m = [{x}, {-x}, 0.0]\n" for id, x in ((40, 0.6), (41, -0.6))
+    )
+    config = parse(CONFIG + camera + anchors, folder=tmp_path)
+
+    there = Ceiling.WORLD_FROM_CAMERA
+    save_placement(tmp_path / "there.toml", Placement(there, 1e-6 * np.eye(6), 0.1, (40, 41)))
+
+    async def main() -> None:
+        # Before its first picture it is located, but what it sees of the floor is not known.
+        unseen = Camera(config.camera[0], config, lambda seen: None).health(0.0)
+        assert (unseen["located"], unseen["view_m"]) == (True, [])
+        async with serving(config, open_camera=Ceiling) as service:
+            ceiling = service.cameras["ceiling"]
+            await until(lambda: ceiling.frames > 2 * PLACEMENT_FRAMES)
+            assert ceiling.placement is not None
+            np.testing.assert_array_equal(ceiling.placement.world_from_camera, there)
 
     run(main)
 

@@ -325,7 +325,7 @@ def test_standard_input_and_a_closed_pipe() -> None:
         (b"half\nhello\n", "text of no known form, such as 'hello'"),
         (b"1,2,3,4,5,6\n" * 500, "its columns have to be named"),
         (bytes(range(128, 250)) * 50, "a wrong baud rate, or an unknown protocol"),
-        (b'{"gyro": [NaN, 0, 0], "accel": [0, 0, 9.8]}\n' * 200, "text of no known form"),
+        (b'{"gyro": [NaN, 0, 0], "accel": [0, 0, 9.8]}\n' * 200, "as JSON it needs"),
     ],
 )
 def test_files_without_a_sample(

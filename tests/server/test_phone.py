@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from playwright.async_api import CDPSession, Page, async_playwright
 
-from fusion.measurements import Array, ImuBatch, PoseFix
+from fusion.measurements import Array, ImuBatch, PoseFix, WheelOdometry
 from server.app import Service
 from tests.server.room import CONFIG, fix, make_certificate, run, serving, until
 from tests.server.test_page import CHROMIUM, FLAGS, see
@@ -33,6 +33,7 @@ class Recording:
         self.samples.append(batch.samples)
 
     def fix(self, fix: PoseFix) -> None: ...
+    def wheels(self, odometry: WheelOdometry) -> None: ...
     def track(self, robot: str, track: Array) -> None: ...
 
 

@@ -124,11 +124,12 @@ def test_a_node_is_told_what_to_look_for_and_its_sightings_become_fixes(room: Co
                 sequence = 0
                 while len(fixes) < 5:
                     sequence += 1
-                    taken = time.monotonic() - 0.05
-                    await connection.send(frame(clock() - 0.05, sequence, found, sent=clock()))
+                    taken = time.monotonic() - 3.0
+                    await connection.send(frame(clock() - 3.0, sequence, found, sent=clock()))
                     await until(lambda: service.cameras["ceiling"].frames == sequence)  # noqa: B023
                 fix = fixes[-1]
-                assert fix.t == pytest.approx(taken, abs=0.02)
+                # When they were taken, not when they came; how exactly is the clock's affair and this machine's.
+                assert fix.t == pytest.approx(taken, abs=1.0)
                 position = fix.hypotheses[0].position
                 assert np.linalg.norm(position - Ceiling.WORLD_FROM_BODY[:3, 3]) < 0.005
                 state = (await health(service))["cameras"]["ceiling"]
@@ -138,8 +139,12 @@ def test_a_node_is_told_what_to_look_for_and_its_sightings_become_fixes(room: Co
                 # Which makes searching for them cheaper: 0.14 and 0.18 m, 2.5 m below 500 px of focal length.
                 sizes = await heard(connection, "sizes")
                 assert 20.0 < sizes["shortest_px"] < 28.0 < 36.0 < sizes["longest_px"] < 45.0
-                await connection.send(status("camera /dev/video0: lost"))
-                await until(lambda: service.cameras["ceiling"].status == "camera /dev/video0: lost")
+                await connection.send(frame(clock() - 3.0, sequence + 1, found, sent=clock(), repeated=[8]))
+                await until(lambda: service.cameras["ceiling"].repeated == {8})
+                # Now and then, as nodes do: the last frame may still be worked on.
+                while service.cameras["ceiling"].status != "camera /dev/video0: lost":
+                    await connection.send(status("camera /dev/video0: lost"))
+                    await asyncio.sleep(0.01)
                 found_health = await health(service)
                 assert "camera ceiling: camera /dev/video0: lost" in found_health["reasons"]
             await until(lambda: "has gone" in service.cameras["ceiling"].status)
@@ -257,8 +262,6 @@ def test_a_camera_with_a_token_is_taken_with_it_alone(room: Config) -> None:
 def test_a_second_node_of_one_name_has_to_wait_until_the_first_is_silent(
     room: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("server.remote_cameras.SILENCE", 0.3)
-
     async def main() -> None:
         async with serving(room) as service:
             camera = service.cameras["ceiling"]
@@ -268,6 +271,7 @@ def test_a_second_node_of_one_name_has_to_wait_until_the_first_is_silent(
                     refused = await camera_hello(second)
                     assert (refused["type"], refused["retry"]) == ("error", True)
                     assert 'camera "ceiling" is already connected, from 127.0.0.1' in refused["reason"]
+                monkeypatch.setattr("server.remote_cameras.SILENCE", 0.3)
                 await until(lambda: "says nothing any more" in camera.status)
                 async with client(service, "/v1/camera") as third:
                     assert (await camera_hello(third))["type"] == "welcome"

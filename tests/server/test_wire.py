@@ -20,6 +20,7 @@ from server.messages import (
     Imu,
     MessageError,
     Units,
+    Wheels,
     encode,
     pose_message,
     tracker_message,
@@ -87,6 +88,18 @@ def test_msgpack_says_the_same_as_json() -> None:
     assert msgspec.msgpack.decode(Dialect(binary=True).encode(pose)) == json.loads(Dialect().encode(pose))
 
 
+def test_what_the_wheels_say() -> None:
+    dialect = Dialect(Hello("rover", units=Units(gyro="deg/s"), clock=Clock("ms", wraps_at=65536.0)))
+    wheels = dialect.decode('{"type":"wheels","samples":[[65530,0.5,-0.1],[4,0.5,null],[null,null,0.1]]}')
+    assert isinstance(wheels, Wheels)
+    # m/s and rad/s, whatever the gyroscope's unit is.
+    assert dialect.wheels(wheels) == [(65.53, 0.5, -0.1), (65.54, 0.5, None), (None, None, 0.1)]
+    nothing = dialect.decode('{"type":"wheels","samples":[[1,0,null],[2,null,null]]}')
+    assert isinstance(nothing, Wheels)
+    with pytest.raises(MessageError, match="sample 1: neither speed nor yaw rate"):
+        dialect.wheels(nothing)
+
+
 def test_other_units_become_si_and_a_counter_does_not_wrap() -> None:
     dialect = Dialect(Hello("rover", units=Units("deg/s", "g"), clock=Clock("us", wraps_at=2.0**32)))
     imu = dialect.decode('{"type":"imu","samples":[[4294967000,180,0,-90,0,0,1],[4704,2000,0,0,0,-2,0]]}')
@@ -119,9 +132,9 @@ def test_a_stamp_a_year_off_among_others(stamp: float) -> None:
         ("[]", 'found a list of 0; needed: an object {"type": ...}'),
         ("[" * 60000, "nested too deeply"),
         ('{"type":"hello","robot":"rover","x":' + "[" * 60000, "nested too deeply"),
-        ('{"robot":"rover"}', '"type" is missing; needed: hello, imu or clock'),
-        ('{"type":"helo"}', '"type" is "helo"; needed: hello, imu or clock'),
-        ('{"type":["hello"]}', '"type" is a list of 1; needed: hello, imu or clock'),
+        ('{"robot":"rover"}', '"type" is missing; needed: hello, imu, wheels or clock'),
+        ('{"type":"helo"}', '"type" is "helo"; needed: hello, imu, wheels or clock'),
+        ('{"type":["hello"]}', '"type" is a list of 1; needed: hello, imu, wheels or clock'),
         ('{"type":"hello"}', '"robot" is missing; needed: the robot\'s name'),
         ('{"type":"hello","robot":7}', '"robot": found 7; needed: the robot\'s name'),
         ('{"type":"hello","robot":"\\ud800"}', "cannot be used: "),
@@ -134,8 +147,8 @@ def test_a_stamp_a_year_off_among_others(stamp: float) -> None:
         ),
         ('{"type":"imu","samples":[]}', "0 samples in one message; needed: 1 to 200"),
         ('{"type":"imu","samples":"none"}', '"samples": found "none"; needed: a list of 1 to 200 samples'),
-        ('{"type":"imu","samples":[7]}', "sample 0: found 7; needed: seven numbers"),
-        ('{"type":"imu","samples":[[0,0,0,0,0,0]]}', "sample 0: found a list of 6; needed: seven numbers"),
+        ('{"type":"imu","samples":[7]}', "sample 0: found 7; needed: the numbers [t, gx, gy"),
+        ('{"type":"imu","samples":[[0,0,0,0,0,0]]}', "sample 0: found a list of 6; needed: the numbers [t, gx, gy"),
         ('{"type":"imu","samples":[[0,0,0,0,0,0,"9.81"]]}', 'sample 0, az: found "9.81"; needed: m/s2, at most 4000'),
         ('{"type":"imu","samples":[[0,0,0,0,0,0,NaN]]}', "JSON knows neither NaN nor Infinity"),
         ('{"type":"imu","samples":[[0,0,0,0,0,0,1e999]]}', "sample 0, az: found Infinity; needed: m/s2"),
@@ -146,6 +159,12 @@ def test_a_stamp_a_year_off_among_others(stamp: float) -> None:
         ('{"type":"imu","samples":[[0,0,0,0,0,0,9.8],[0,720,0,0,0,0,0]]}', "sample 1, gx: found 720; needed: rad/s"),
         ('{"type":"imu","samples":[[0,720,0,0,0,0,0]]}', 'degrees a second are told by "units": {"gyro": "deg/s"}'),
         (json.dumps({"type": "imu", "samples": [[0.0] * 7] * 201}), "201 samples in one message; needed: 1 to 200"),
+        (
+            '{"type":"wheels","samples":[[0,1]]}',
+            "sample 0: found a list of 2; needed: the numbers [t, speed, yaw_rate]",
+        ),
+        ('{"type":"wheels","samples":[[0,1000,0]]}', "sample 0, speed: found 1000; needed: m/s, at most 100"),
+        ('{"type":"wheels","samples":[[0,0,720]]}', "sample 0, yaw_rate: found 720; needed: rad/s, at most 200"),
         ('{"type":"clock","id":1}', '"received" is missing; needed: when the question came'),
     ],
 )
@@ -229,7 +248,7 @@ def test_an_early_answer_does_not_change_the_rate() -> None:
         now = 100.0 + i * 1e-3
         if i % 50 == 17:
             assert client.subscription.is_due(now, early=True)
-            hub.answer(now, client.subscription, b"early")
+            hub.send(now, client.subscription, b"early")
             assert client.received[-1] == b"early"
             answered += 1
         if i % 10 == 0:
@@ -244,7 +263,7 @@ def test_more_batches_than_poses_are_not_all_answered() -> None:
     for i in range(2000):
         now = 100.0 + i * 0.005
         if client.subscription.is_due(now, early=True):
-            hub.answer(now, client.subscription, b"early")
+            hub.send(now, client.subscription, b"early")
     assert len(client.received) == pytest.approx(200, abs=2)
 
 
