@@ -211,6 +211,7 @@ STILL_PAUSE = 2.0  # s: and for so long it is believed
 LEAST_CONSTRAINT = 0.005  # of a constraint's variance is believed where it is kept ever so well
 WRONG_SCALE = 0.2  # of gravity: no bias is so large
 FORCE_SAMPLES = 1000
+SLIPS = 9.0  # squared innovation of wheels over the expected one: more is no noise
 STUCK_AFTER = 8  # samples that repeat each other to the last digit: nobody measures
 SPIKE = 20.0  # times the usual change, and more than these: one sample alone is held to be lost
 SPIKE_GYRO, SPIKE_ACCEL = 3.0, 30.0  # rad/s, m/s2
@@ -1133,9 +1134,12 @@ def _odometry(s, prm, reading):
 
         y_v = z_v - (1 + s_v) e_xᵀR̂ᵀv̂,    y_ω = z_ω - (1 + s_ω) (ω_z - b_z)
 
-    Loosened as constraints are: wheels slip. NaN: the robot does not tell. Without an IMU their yaw rate turns it.
+    Wheels slip: a reading whose yaw rate the gyroscope denies by more than three sigma is left out, and a speed that is
+    far off is loosened as constraints are, since its witness is weaker. What follows counts for less.
+    NaN: the robot does not tell. Without an IMU their yaw rate turns it.
     """
     B = np.empty((3, 3))
+    slips = False
     # What wheels get wrong they get wrong for a while: a second of them tells the same at whatever rate.
     share = max(1.0 / (GRID_HZ * max(s[T] - s[T_WHEEL], 1e-3)), 1.0)
     s[T_WHEEL] = s[T]
@@ -1161,16 +1165,19 @@ def _odometry(s, prm, reading):
             H[m, DWHEEL + i] = value
             y[m] = reading[1 + i] - scale * value
             variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share
-            variances[m] = _loosened(variance, max(s[WHEEL_NIS + i], 1.0), y[m])
             if o == MAIN:
-                expected = variances[m]
+                expected = variance
                 for c in range(N):
                     for d in range(N):
                         expected += H[m, c] * s[COV + N * c + d] * H[m, d]
-                loose = max(s[WHEEL_NIS + i], 1.0)
-                s[WHEEL_NIS + i] += 0.05 / share * (min(y[m] * y[m] / expected, 9.0) * loose - s[WHEEL_NIS + i])
+                off = y[m] * y[m] / expected
+                slips |= i == 1 and off > SLIPS
+                s[WHEEL_NIS + i] += 0.05 / share * (min(off, SLIPS) - s[WHEEL_NIS + i])
+            variances[m] = variance * max(s[WHEEL_NIS + i], 1.0)
+            if i == 0:
+                variances[m] = max(variances[m], y[m] * y[m])
             m += 1
-        if m > 0:
+        if m > 0 and not slips:
             R = np.zeros((m, m))
             for i in range(m):
                 R[i, i] = variances[i]

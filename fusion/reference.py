@@ -247,7 +247,7 @@ class _State:
         self.constraint_nis, self.usual_speed2 = np.ones(4), 0.0
         self.adapted, self.t_adapted = 0.0, -math.inf
         self.t_wheel, self.wheel_rate, self.wheel_share = -math.inf, 0.0, 1.0
-        self.wheel_nis = [0.0, 0.0]  # of speed, of yaw rate
+        self.wheel_nis, self.slips = [0.0, 0.0], False  # of speed, of yaw rate
         self.systematic = np.zeros(36)
         self.place, self.place2, self.place_count = np.zeros(3), np.zeros(3), 0
 
@@ -980,20 +980,21 @@ class ReferenceTimeline:
         values = np.array([body[0], state.u[2] - f.gyro_bias[2]])
         H[:, DWHEEL] = np.diag(values)
         y = np.array(reading[1:]) - (1.0 + f.wheel_scale) * values
-        rows, variances = [], []
+        rows, variances, nis = [], [], list(state.wheel_nis)
+        if f is state.main:
+            state.slips = False
         for i, sigma in enumerate((p.wheel_speed_sigma, p.wheel_rate_sigma)):
             if math.isnan(y[i]) or (i == 1 and state.bridging):
                 continue
-            loose = max(state.wheel_nis[i], 1.0)
-            variance = max(sigma**2 * state.wheel_share * loose, float(y[i] ** 2))
-            rows.append(i)
-            variances.append(variance)
+            variance = sigma**2 * state.wheel_share
             if f is state.main:
-                now = min(y[i] ** 2 / (variance + H[i] @ f.P @ H[i]), 9.0) * loose
-                nis = list(state.wheel_nis)
-                nis[i] += 0.05 / state.wheel_share * (now - nis[i])
-                state.wheel_nis = nis
-        if rows:
+                off = y[i] ** 2 / (variance + H[i] @ f.P @ H[i])
+                state.slips |= bool(i == 1 and off > k.SLIPS)
+                nis[i] += 0.05 / state.wheel_share * (min(off, k.SLIPS) - nis[i])
+            rows.append(i)
+            variances.append(max(variance * max(nis[i], 1.0), float(y[i] ** 2) if i == 0 else 0.0))
+        state.wheel_nis = nis
+        if rows and not state.slips:
             f.correct(H[rows], y[rows], np.diag(variances))
 
     def _pose(self, state: _State) -> Array:
