@@ -92,13 +92,15 @@ STILL_FORCE = AUX + 85  # m/s2: mean specific force since it is at rest (3)
 SYSTEMATIC = AUX + 88  # covariance of what the last fix taken had wrong in common with all others, world axes (36)
 TWINS = AUX + 124  # 1 while the shadow is the other pose of the first fix
 LEAD = AUX + 125  # by how much the scores of the fixes since then favour the filter over it
+FORCE_MEAN = AUX + 126  # m/s2: mean magnitude of the specific force,
+FORCE_COUNT = AUX + 127  # over so many samples
 CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
 PLACE = AUX + 76  # m: mean of where fixes have found it (3)
 PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (3)
 PLACE_COUNT = AUX + 82
 ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
 T_ADAPTED = AUX + 62  # s: the last of them
-STATE = AUX + 126
+STATE = AUX + 128
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -207,6 +209,8 @@ LEAVE_STILL = 9.35  # chi-square .975 at 3 degrees of freedom: a fix that is fur
 STILL_PUSH = 0.1  # m/s2: less is drift, and what a floor gives under a robot that stands
 STILL_PAUSE = 2.0  # s: and for so long it is believed
 LEAST_CONSTRAINT = 0.005  # of a constraint's variance is believed where it is kept ever so well
+WRONG_SCALE = 0.2  # of gravity: no bias is so large
+FORCE_SAMPLES = 1000
 SLIPS = 9.0  # squared innovation of wheels over the expected one: more is no noise
 STUCK_AFTER = 8  # samples that repeat each other to the last digit: nobody measures
 SPIKE = 20.0  # times the usual change, and more than these: one sample alone is held to be lost
@@ -1169,9 +1173,9 @@ def _odometry(s, prm, reading):
                 off = y[m] * y[m] / expected
                 slips |= i == 1 and off > SLIPS
                 s[WHEEL_NIS + i] += 0.05 / share * (min(off, SLIPS) - s[WHEEL_NIS + i])
-            variances[m] = variance * max(s[WHEEL_NIS + i], 1.0)
             if i == 0:
-                variances[m] = max(variances[m], y[m] * y[m])
+                variance = max(variance, y[m] * y[m] * share)
+            variances[m] = variance * max(s[WHEEL_NIS + i], 1.0)
             m += 1
         if m > 0 and not slips:
             R = np.zeros((m, m))
@@ -1205,10 +1209,19 @@ def _next_sample(s, prm, imu, k):
     s[NEXT_T] = t
     # Whether a pause is bridged depends on the stamps of the IMU alone, not on the fixes within it.
     s[BRIDGING] = 1.0 if t - s[T_IMU] > prm[IMU_GAP] else 0.0
+    # On the floor what is felt is gravity, on the mean: where it is far from that the scale is wrong.
+    scale = 1.0
+    if prm[MOTION] != FREE:
+        size = math.sqrt(imu[row, 4] * imu[row, 4] + imu[row, 5] * imu[row, 5] + imu[row, 6] * imu[row, 6])
+        n = min(s[FORCE_COUNT] + 1.0, FORCE_SAMPLES)
+        s[FORCE_COUNT] = n
+        s[FORCE_MEAN] += (min(size, 10.0 * GRAVITY) - s[FORCE_MEAN]) / n
+        if abs(s[FORCE_MEAN] / GRAVITY - 1.0) > WRONG_SCALE:
+            scale = GRAVITY / max(s[FORCE_MEAN], 0.01 * GRAVITY)
     gyro, accel = 0.0, 0.0
     saturated = False
     for i in range(6):
-        s[NEXT_U + i] = imu[row, 1 + i]
+        s[NEXT_U + i] = imu[row, 1 + i] * (1.0 if i < 3 else scale)
         change = s[NEXT_U + i] - s[U + i]
         if i < 3:
             gyro += change * change
@@ -1388,7 +1401,7 @@ def _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live):
                 n = min(s[ACCEL_COUNT] + 1.0, 100.0)
                 s[ACCEL_COUNT] = n
                 for i in range(3):
-                    s[ACCEL_MEAN + i] += (imu[row, 4 + i] - s[ACCEL_MEAN + i]) / n
+                    s[ACCEL_MEAN + i] += (s[NEXT_U + 3 + i] - s[ACCEL_MEAN + i]) / n
             s[T_IMU] = t
             _grid(s, prm)
             k += 1

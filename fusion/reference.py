@@ -992,7 +992,9 @@ class ReferenceTimeline:
                 state.slips |= bool(i == 1 and off > k.SLIPS)
                 nis[i] += 0.05 / state.wheel_share * (min(off, k.SLIPS) - nis[i])
             rows.append(i)
-            variances.append(max(variance * max(nis[i], 1.0), float(y[i] ** 2) if i == 0 else 0.0))
+            if i == 0:
+                variance = max(variance, float(y[i] ** 2) * state.wheel_share)
+            variances.append(variance * max(nis[i], 1.0))
         state.wheel_nis = nis
         if rows and not state.slips:
             f.correct(H[rows], y[rows], np.diag(variances))
