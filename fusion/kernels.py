@@ -92,7 +92,6 @@ STILL_FORCE = AUX + 85  # m/s2: mean specific force since it is at rest (3)
 SYSTEMATIC = AUX + 88  # covariance of what the last fix taken had wrong in common with all others, world axes (36)
 TWINS = AUX + 124  # 1 while the shadow is the other pose of the first fix
 LEAD = AUX + 125  # by how much the scores of the fixes since then favour the filter over it
-WHEEL_DOUBT = AUX + 128  # by how much more the variance of wheels is, since fixes have contradicted what came of them
 FORCE_MEAN = AUX + 126  # m/s2: mean magnitude of the specific force,
 FORCE_COUNT = AUX + 127  # over so many samples
 CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
@@ -101,7 +100,7 @@ PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (
 PLACE_COUNT = AUX + 82
 ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
 T_ADAPTED = AUX + 62  # s: the last of them
-STATE = AUX + 129
+STATE = AUX + 128
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
 E = 0  # world axes: position (3), rotation vector (3)
@@ -212,8 +211,6 @@ STILL_PAUSE = 2.0  # s: and for so long it is believed
 LEAST_CONSTRAINT = 0.005  # of a constraint's variance is believed where it is kept ever so well
 WRONG_SCALE = 0.2  # of gravity: no bias is so large
 FORCE_SAMPLES = 1000
-DOUBTED, TRUSTED_AGAIN, MOST_DOUBT = 10.0, 0.95, 1e4  # factors of the variance of wheels, for each fix
-IN_USE = 1.0  # s: wheels have told something so lately
 SLIPS = 9.0  # squared innovation of wheels over the expected one: more is no noise
 STUCK_AFTER = 8  # samples that repeat each other to the last digit: nobody measures
 SPIKE = 20.0  # times the usual change, and more than these: one sample alone is held to be lost
@@ -887,11 +884,6 @@ def _judge(s, prm, fix):
             if fix[F_D2_POSITION] > LEAVE_STILL:
                 s[STILL_SINCE] = math.inf
                 s[STILL_BARRED] = s[T] + STILL_PAUSE
-            if s[T] - s[T_WHEEL] < IN_USE:
-                # A dead encoder, or a reversed one, agrees with itself.
-                contradicted = fix[F_D2_POSITION] > prm[GATE_BLOCK]
-                doubt = s[WHEEL_DOUBT] * (DOUBTED if contradicted else TRUSTED_AGAIN)
-                s[WHEEL_DOUBT] = min(max(doubt, 1.0), MOST_DOUBT)
             fix[F_OUTCOME] = INFLATED if ratio > 1.0 else ACCEPTED
         if ratio > prm[GATE_INFLATION]:
             if o == MAIN and fix[F_D2_POSITION] <= prm[GATE_BLOCK]:
@@ -1172,7 +1164,7 @@ def _odometry(s, prm, reading):
                 H[m, DBG + 2] = -scale
             H[m, DWHEEL + i] = value
             y[m] = reading[1 + i] - scale * value
-            variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share * s[WHEEL_DOUBT]
+            variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share
             if o == MAIN:
                 expected = variance
                 for c in range(N):
@@ -1181,9 +1173,9 @@ def _odometry(s, prm, reading):
                 off = y[m] * y[m] / expected
                 slips |= i == 1 and off > SLIPS
                 s[WHEEL_NIS + i] += 0.05 / share * (min(off, SLIPS) - s[WHEEL_NIS + i])
-            variances[m] = variance * max(s[WHEEL_NIS + i], 1.0)
             if i == 0:
-                variances[m] = max(variances[m], y[m] * y[m])
+                variance = max(variance, y[m] * y[m] * share)
+            variances[m] = variance * max(s[WHEEL_NIS + i], 1.0)
             m += 1
         if m > 0 and not slips:
             R = np.zeros((m, m))
@@ -1319,7 +1311,7 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                         az = GRAVITY * az + s[o + BA + 2]
                         rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
                         if turns:
-                            rate_noise = prm[WHEEL_RATE_SIGMA] * math.sqrt(s[WHEEL_DOUBT] / GRID_HZ)
+                            rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
                     predict(
                         s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt,
                         rate_noise, force_noise, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK],
@@ -1842,7 +1834,6 @@ def new_memory(parameters: Array) -> Array:
     state[STILL_BARRED] = state[T_ADAPTED] = state[GRID_AT] = -math.inf
     state[SCALE : SCALE + 4] = state[CONSTRAINT_NIS : CONSTRAINT_NIS + 4] = 1.0
     state[USUAL_SPEED2] = prm[USUAL_SPEED] ** 2
-    state[WHEEL_DOUBT] = 1.0
     checkpoints[0] = state
     meta[CP_END] = 1.0
     return memory

@@ -248,7 +248,6 @@ class _State:
         self.adapted, self.t_adapted = 0.0, -math.inf
         self.t_wheel, self.wheel_rate, self.wheel_share = -math.inf, 0.0, 1.0
         self.wheel_nis, self.slips = [0.0, 0.0], False  # of speed, of yaw rate
-        self.wheel_doubt = 1.0
         self.force_mean, self.force_count = 0.0, 0
         self.systematic = np.zeros(36)
         self.place, self.place2, self.place_count = np.zeros(3), np.zeros(3), 0
@@ -631,7 +630,7 @@ class ReferenceTimeline:
             # straight on, unless the wheels say how it turns
             turns = t - state.t_wheel <= p.imu_gap
             rate = [0.0, 0.0, state.wheel_rate if turns else 0.0]
-            rate_noise = p.wheel_rate_sigma * math.sqrt(state.wheel_doubt / k.GRID_HZ) if turns else p.no_imu_rate_noise
+            rate_noise = p.wheel_rate_sigma / math.sqrt(k.GRID_HZ) if turns else p.no_imu_rate_noise
             force = GRAVITY * f.rotation.T @ f.up
             f.move(f.bias + np.concatenate([rate, force]), dt, (rate_noise, 0.0, *walks))
             f.slow(dt, p.no_imu_accel_noise)
@@ -799,9 +798,6 @@ class ReferenceTimeline:
                 S, R = S + more * R, R + more * R
         if fix[k.F_D2_POSITION] > k.LEAVE_STILL:
             state.still_since, state.still_barred = math.inf, state.t + k.STILL_PAUSE
-        if state.t - state.t_wheel < k.IN_USE:
-            doubt = k.DOUBTED if fix[k.F_D2_POSITION] > p.gate_block else k.TRUSTED_AGAIN
-            state.wheel_doubt = min(max(state.wheel_doubt * doubt, 1.0), k.MOST_DOUBT)
         if ratio <= p.gate_inflation:
             self._adapt(state, figures, k.MOST_TAUGHT)
             fix[k.F_OUTCOME] = k.ACCEPTED
@@ -998,13 +994,15 @@ class ReferenceTimeline:
         for i, sigma in enumerate((p.wheel_speed_sigma, p.wheel_rate_sigma)):
             if math.isnan(y[i]) or (i == 1 and state.bridging):
                 continue
-            variance = sigma**2 * state.wheel_share * state.wheel_doubt
+            variance = sigma**2 * state.wheel_share
             if f is state.main:
                 off = y[i] ** 2 / (variance + H[i] @ f.P @ H[i])
                 state.slips |= bool(i == 1 and off > k.SLIPS)
                 nis[i] += 0.05 / state.wheel_share * (min(off, k.SLIPS) - nis[i])
             rows.append(i)
-            variances.append(max(variance * max(nis[i], 1.0), float(y[i] ** 2) if i == 0 else 0.0))
+            if i == 0:
+                variance = max(variance, float(y[i] ** 2) * state.wheel_share)
+            variances.append(variance * max(nis[i], 1.0))
         state.wheel_nis = nis
         if rows and not state.slips:
             f.correct(H[rows], y[rows], np.diag(variances))

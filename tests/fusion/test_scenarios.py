@@ -287,17 +287,14 @@ def test_wheels_make_it_better_and_carry_it_without_the_camera():
         assert drive(lost, None, "differential").error(AT).position.max() < 0.15
 
 
-CONTRADICTED = pytest.mark.xfail(strict=True, reason="wheels are believed, not the fixes: 1 to 2 m, 12 resets")
-
-
 @pytest.mark.parametrize(
     "factors",
     [
-        pytest.param((-1.0, 1.0), id="backwards", marks=CONTRADICTED),
+        pytest.param((-1.0, 1.0), id="backwards"),
         pytest.param((1.0, -1.0), id="turning the other way"),
         pytest.param((1000.0, 1.0), id="mm/s"),
         pytest.param((1.0, 57.3), id="deg/s"),
-        pytest.param((0.0, 0.0), id="nothing but zeros", marks=CONTRADICTED),
+        pytest.param((0.0, 0.0), id="nothing but zeros"),
     ],
 )
 def test_wheels_that_are_altogether_wrong_do_no_harm(factors):
