@@ -1623,7 +1623,14 @@ def _move(position, quaternion, ch, dt):
 
 
 @_jit
-def _absorb(s, ch, plain):
+def _ahead(dt, age, gap):
+    """s: for so long at its speed of now does the robot get as far as in dt s, its last IMU sample `age` old."""
+    fresh = min(max(gap - age, 0.0), dt)
+    return fresh + COAST_TIME * (1.0 - math.exp((fresh - dt) / COAST_TIME))
+
+
+@_jit
+def _absorb(s, prm, ch, plain):
     """Set E such that the smooth pose does not move by what an input has done to the filter's."""
     moved = False
     for i in range(6):
@@ -1660,8 +1667,8 @@ def _absorb(s, ch, plain):
         _rotate(turn, new)
         for i in range(3):
             old[1 + i] = -old[1 + i]
-            e = ch[BEFORE + 1 + i] + ch[BEFORE + 8 + i] * (at - ch[BEFORE])
-            ch[E + i] += e - s[POS + i] - s[V + i] * (at - s[T])
+            e = ch[BEFORE + 1 + i] + ch[BEFORE + 8 + i] * _ahead(at - ch[BEFORE], ch[BEFORE] - s[T_IMU], prm[IMU_GAP])
+            ch[E + i] += e - s[POS + i] - s[V + i] * _ahead(at - s[T], s[T] - s[T_IMU], prm[IMU_GAP])
         _rotate(ch[E + 3 :], old)
         # Exp(E') = Exp(E) old newᵀ; new stands conjugated already
         w = old[0] * new[0] - old[1] * new[1] - old[2] * new[2] - old[3] * new[3]
@@ -1755,7 +1762,7 @@ def process(memory, task, channel, t, inputs, outputs):
             answer = _insert_fix(state, prm, fixes, checkpoints, meta, inputs[i])
         _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live)
         if live and started:
-            _absorb(state, ch, meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor)
+            _absorb(state, prm, ch, meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor)
         elif live:
             ch[E_T] = state[T]
         if task == FEED_SAMPLES and i < outputs.shape[0]:

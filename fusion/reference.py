@@ -377,7 +377,8 @@ class ReferenceTimeline:
     def _moving(self) -> Moving:
         s = self._state
         f = s.main
-        return Moving(s.t, f.position, f.rotation, f.velocity, f.bias if s.bridging else s.u, f.bias, s.reset_id)
+        fresh_until, u = s.t_imu + self._params.imu_gap, f.bias if s.bridging else s.u
+        return Moving(s.t, fresh_until, f.position, f.rotation, f.velocity, u, f.bias, s.reset_id)
 
     def _absorb(self, before: tuple[bool, int, int, Array, Moving]) -> None:
         started, rewinds, cursor, corrected, moving = before

@@ -18,10 +18,11 @@ from fusion.measurements import Array
 
 
 class Motion(NamedTuple):
-    """Where a filter is and how it moves: t, position, rotation (3, 3), velocity (world), IMU sample u (6,) and its
-    bias, its reset_id."""
+    """Where a filter is and how it moves: t, until when its last IMU sample is good, position, rotation (3, 3),
+    velocity (world), IMU sample u (6,) and its bias, its reset_id."""
 
     t: float
+    fresh_until: float
     position: Array
     rotation: Array
     velocity: Array
@@ -29,10 +30,12 @@ class Motion(NamedTuple):
     bias: Array
     reset_id: int
 
-    def at(self, t: float) -> tuple[Array, Array]:
-        """Position and rotation at t, straight on."""
+    def at(self, t: float, fresh_until: float) -> tuple[Array, Array]:
+        """Position and rotation at t, straight on; from `fresh_until` the speed decays."""
         dt = t - self.t
-        return self.position + self.velocity * dt, self.rotation @ exp_so3((self.u - self.bias)[:3] * dt)
+        fresh = min(max(fresh_until - self.t, 0.0), dt)
+        far = fresh + k.COAST_TIME * (1.0 - math.exp((fresh - dt) / k.COAST_TIME))
+        return self.position + self.velocity * far, self.rotation @ exp_so3((self.u - self.bias)[:3] * dt)
 
 
 class Smoother:
@@ -97,7 +100,7 @@ class Smoother:
         if corrected is not None:
             e = e - corrected
         else:
-            (old, old_rotation), (new, new_rotation) = before.at(at), after.at(at)
+            (old, old_rotation), (new, new_rotation) = before.at(at, after.fresh_until), after.at(at, after.fresh_until)
             turn = log_so3(exp_so3(e[3:]) @ old_rotation @ new_rotation.T)
             e = np.concatenate([e[:3] + old - new, turn])
         far = math.hypot(*e[:3]) > k.SMOOTH_DISTANCE
