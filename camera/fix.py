@@ -354,16 +354,16 @@ def _planar(
     directions = rays(corners, intrinsics)
     by_ray = np.ascontiguousarray(project(directions, intrinsics)[1][:, :, :2])
     count = np.array([4 * len(markers) for _, markers in seen])
-    states, covariances, misfits = solve_planar(
+    states, covariances, systematic, misfits = solve_planar(
         points, directions, by_ray, sigma_px, count, world_from_camera, placement
     )
     hypotheses: dict[str, list[PoseHypothesis]] = {}
-    for (body, _), (x, y, yaw), covariance, misfit in zip(
-        seen, states.tolist(), covariances, misfits.tolist(), strict=True
+    for (body, _), (x, y, yaw), covariance, repeats, misfit in zip(
+        seen, states.tolist(), covariances, systematic, misfits.tolist(), strict=True
     ):
         if math.isfinite(misfit):
             quaternion = np.array([math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
-            hypotheses[body.name] = [PoseHypothesis(np.array([x, y, 0.0]), quaternion, covariance, misfit)]
+            hypotheses[body.name] = [PoseHypothesis(np.array([x, y, 0.0]), quaternion, covariance, misfit, repeats)]
     return hypotheses
 
 
@@ -371,8 +371,10 @@ def _six(view: View, seen: Sequence[Seen], placement: Array) -> list[PoseHypothe
     hypotheses = []
     for world_from_body, noise, misfit in solve_six(view, seen):
         moved = _body_by_placement(world_from_body[:3, 3], view.world_from_camera[:3, 3])
-        covariance = noise * _inflation(misfit, 2 * len(view.points_body) - 6) + moved @ placement @ moved.T
-        hypotheses.append(_hypothesis(world_from_body, covariance, misfit))
+        repeats = moved @ placement @ moved.T
+        covariance = noise * _inflation(misfit, 2 * len(view.points_body) - 6) + repeats
+        quaternion = quaternion_from_rotation(world_from_body[:3, :3])
+        hypotheses.append(PoseHypothesis(world_from_body[:3, 3], quaternion, covariance, misfit, repeats))
     return hypotheses
 
 
@@ -416,7 +418,3 @@ def _same(a: Array, b: Array) -> bool:
     """The same pose to 1e-5 of the distance and 1e-4 rad, which is where the refinement stops."""
     shift = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= 1e-5 * (1.0 + np.linalg.norm(a[:3, 3]))
     return bool(shift and np.linalg.norm(a[:3, :3] - b[:3, :3]) <= 2e-4)
-
-
-def _hypothesis(world_from_body: Array, covariance: Array, misfit: float) -> PoseHypothesis:
-    return PoseHypothesis(world_from_body[:3, 3], quaternion_from_rotation(world_from_body[:3, :3]), covariance, misfit)

@@ -36,24 +36,26 @@ def solve_planar(
     count: NDArray[np.int_],
     world_from_camera: Array,
     placement: Array,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """The level poses of m bodies, all corners of one after those of the other.
 
     `points_body`: (n, 3) corners in their body's frame, m. `rays_camera`: (n, 2) where they are seen, x/z and y/z.
     `by_ray`: (n, 2, 2) px by ray. `residual_sigma`: (n,) of a corner's coordinate, px. `count`: (m,) corners of each.
     `placement`: (6, 6) covariance of `world_from_camera`, position and rotation, world axes.
-    -> (m, 3) x, y, yaw, m and rad, (m, 6, 6) covariance of the pose as in `fusion.measurements`, and (m,) misfit as in
-    `PoseHypothesis`: NaN for a body that no pose in front of the camera explains.
+    -> (m, 3) x, y, yaw, m and rad, (m, 6, 6) covariance and its systematic part, and (m,) misfit, as in
+    `fusion.measurements.PoseHypothesis`: NaN for a body that no pose in front of the camera explains.
     """
-    state, covariance, misfit = np.zeros((len(count), 3)), np.zeros((len(count), 6, 6)), np.zeros(len(count))
+    m = len(count)
+    state, covariance, systematic, misfit = np.zeros((m, 3)), np.zeros((m, 6, 6)), np.zeros((m, 6, 6)), np.zeros(m)
     _solve(
-        points_body, rays_camera, by_ray, residual_sigma, count, world_from_camera, placement, state, covariance, misfit
-    )
-    return state, covariance, misfit
+        points_body, rays_camera, by_ray, residual_sigma, count, world_from_camera, placement,
+        state, covariance, systematic, misfit,
+    )  # fmt: skip
+    return state, covariance, systematic, misfit
 
 
 @_jit
-def _solve(points, rays, by_ray, sigma, count, pose, placement, state, covariance, misfit):
+def _solve(points, rays, by_ray, sigma, count, pose, placement, state, covariance, systematic, misfit):
     J = np.zeros((2, 6))
     normal, gradient = np.zeros((6, 6)), np.zeros(6)
     noise = np.zeros((3, 3))
@@ -76,7 +78,8 @@ def _solve(points, rays, by_ray, sigma, count, pose, placement, state, covarianc
             if gain < _SMALL_GAIN:
                 break
         if possible:
-            _covariance(normal, noise, misfit[k], last - first, pose, placement, state[k], covariance[k])
+            corners = last - first
+            _covariance(normal, noise, misfit[k], corners, pose, placement, state[k], covariance[k], systematic[k])
         else:
             misfit[k] = math.nan
 
@@ -173,7 +176,8 @@ def _inverse(normal, noise):
 
 
 @_jit
-def _covariance(normal, noise, misfit, corners, pose, placement, state, covariance):
+def _covariance(normal, noise, misfit, corners, pose, placement, state, covariance, systematic):
+    # What is wrong with the assumptions and with the camera's place is so in each frame: the systematic part.
     # How the solved part answers to a motion of the body that the solve does not know of: dx = response @ motion.
     # Height and tilt are errors of what was assumed ("consider" covariance), a misplaced camera moves all six.
     response, moved = np.zeros((3, 6)), np.zeros((3, 6))
@@ -190,7 +194,7 @@ def _covariance(normal, noise, misfit, corners, pose, placement, state, covarian
         for j in range(6):
             for l in range(3):
                 variance = FLOOR_HEIGHT_SIGMA**2 if l == 0 else FLOOR_TILT_SIGMA**2
-                covariance[i, j] += assumed[i, l] * variance * assumed[j, l]
+                systematic[i, j] += assumed[i, l] * variance * assumed[j, l]
     # A body moves with the camera as one, (I, -[x]x; 0, I) with x from the camera to the body.
     x, y, z = state[0] - pose[0, 3], state[1] - pose[1, 3], -pose[2, 3]
     for i in range(3):
@@ -207,8 +211,8 @@ def _covariance(normal, noise, misfit, corners, pose, placement, state, covarian
     inflation = max(1.0, misfit / (freedom * (1.0 - spread + 3.0902 * math.sqrt(spread)) ** 3))
     for i in range(3):
         for j in range(3):
-            total = noise[i, j] * inflation
             for l in range(6):
                 for n in range(6):
-                    total += moved[i, l] * placement[l, n] * moved[j, n]
-            covariance[_solved(i), _solved(j)] += total
+                    systematic[_solved(i), _solved(j)] += moved[i, l] * placement[l, n] * moved[j, n]
+            covariance[_solved(i), _solved(j)] = noise[i, j] * inflation
+    covariance += systematic
