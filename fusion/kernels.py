@@ -92,7 +92,7 @@ STILL_FORCE = AUX + 85  # m/s2: mean specific force since it is at rest (3)
 SYSTEMATIC = AUX + 88  # covariance of what the last fix taken had wrong in common with all others, world axes (36)
 TWINS = AUX + 124  # 1 while the shadow is the other pose of the first fix
 LEAD = AUX + 125  # by how much the scores of the fixes since then favour the filter over it
-FORCE_MEAN = AUX + 126  # m/s2: mean magnitude of the specific force,
+FORCE2 = AUX + 126  # (m/s2)^2: mean square of the specific force,
 FORCE_COUNT = AUX + 127  # over so many samples
 CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
 PLACE = AUX + 76  # m: mean of where fixes have found it (3)
@@ -209,7 +209,7 @@ LEAVE_STILL = 9.35  # chi-square .975 at 3 degrees of freedom: a fix that is fur
 STILL_PUSH = 0.1  # m/s2: less is drift, and what a floor gives under a robot that stands
 STILL_PAUSE = 2.0  # s: and for so long it is believed
 LEAST_CONSTRAINT = 0.005  # of a constraint's variance is believed where it is kept ever so well
-WRONG_SCALE = 0.2  # of gravity: no bias is so large
+LEAST_FORCE2, MOST_FORCE2 = (0.8 * GRAVITY) ** 2, (1.2 * GRAVITY) ** 2  # no bias is so large
 FORCE_SAMPLES = 1000
 SLIPS = 9.0  # squared innovation of wheels over the expected one: more is no noise
 STUCK_AFTER = 8  # samples that repeat each other to the last digit: nobody measures
@@ -1211,29 +1211,30 @@ def _next_sample(s, prm, imu, k):
     s[BRIDGING] = 1.0 if t - s[T_IMU] > prm[IMU_GAP] else 0.0
     # On the floor what is felt is gravity, on the mean: where it is far from that the scale is wrong.
     scale = 1.0
-    if prm[MOTION] != FREE and s[FORCE_COUNT] > 0.0 and abs(s[FORCE_MEAN] / GRAVITY - 1.0) > WRONG_SCALE:
-        scale = GRAVITY / max(s[FORCE_MEAN], 0.01 * GRAVITY)
-    gyro, accel = 0.0, 0.0
+    if prm[MOTION] != FREE and s[FORCE_COUNT] > 0.0 and not LEAST_FORCE2 < s[FORCE2] < MOST_FORCE2:
+        scale = GRAVITY / math.sqrt(max(s[FORCE2], 1e-4 * GRAVITY * GRAVITY))
+    gyro, accel, force2, largest_gyro, largest_accel = 0.0, 0.0, 0.0, 0.0, 0.0
     saturated = False
-    for i in range(6):
-        s[NEXT_U + i] = imu[row, 1 + i] * (1.0 if i < 3 else scale)
-        change = s[NEXT_U + i] - s[U + i]
-        if i < 3:
-            gyro += change * change
-        else:
-            accel += change * change
-        if change == 0.0 and abs(s[U + i]) >= max(
-            s[LARGEST_GYRO + i // 3], SATURATED_GYRO if i < 3 else SATURATED_ACCEL
-        ):
-            s[CLIPPED + i // 3] += 1.0
-            saturated |= s[CLIPPED + i // 3] >= CLIPPED_OFTEN
+    for i in range(3):
+        rate, force = imu[row, 1 + i], scale * imu[row, 4 + i]
+        s[NEXT_U + i], s[NEXT_U + 3 + i] = rate, force
+        force2 += imu[row, 4 + i] * imu[row, 4 + i]
+        faster, harder = rate - s[U + i], force - s[U + 3 + i]
+        gyro += faster * faster
+        accel += harder * harder
+        largest_gyro, largest_accel = max(largest_gyro, abs(rate)), max(largest_accel, abs(force))
+        if faster == 0.0 and abs(rate) >= max(s[LARGEST_GYRO], SATURATED_GYRO):
+            s[CLIPPED] += 1.0
+            saturated |= s[CLIPPED] >= CLIPPED_OFTEN
+        if harder == 0.0 and abs(force) >= max(s[LARGEST_ACCEL], SATURATED_ACCEL):
+            s[CLIPPED + 1] += 1.0
+            saturated |= s[CLIPPED + 1] >= CLIPPED_OFTEN
     if gyro + accel == 0.0:
         s[SAME_RUN] += 1.0
     else:
         s[SAME_RUN] = 0.0
-        size = math.sqrt(imu[row, 4] * imu[row, 4] + imu[row, 5] * imu[row, 5] + imu[row, 6] * imu[row, 6])
         s[FORCE_COUNT] = min(s[FORCE_COUNT] + 1.0, FORCE_SAMPLES)
-        s[FORCE_MEAN] += (min(size, 10.0 * GRAVITY) - s[FORCE_MEAN]) / s[FORCE_COUNT]
+        s[FORCE2] += (min(force2, 100.0 * GRAVITY * GRAVITY) - s[FORCE2]) / s[FORCE_COUNT]
     if s[SAME_RUN] >= STUCK_AFTER:
         s[BRIDGING] = 1.0
     spike = gyro > max(SPIKE * SPIKE * s[CHANGE_GYRO], SPIKE_GYRO * SPIKE_GYRO)
@@ -1248,10 +1249,10 @@ def _next_sample(s, prm, imu, k):
         if s[LARGEST_ACCEL] > 0.0:
             s[CHANGE_GYRO] += 0.02 * (gyro - s[CHANGE_GYRO])
             s[CHANGE_ACCEL] += 0.02 * (accel - s[CHANGE_ACCEL])
-        for i in range(6):
-            if abs(s[NEXT_U + i]) > s[LARGEST_GYRO + i // 3]:
-                s[LARGEST_GYRO + i // 3] = abs(s[NEXT_U + i])
-                s[CLIPPED + i // 3] = 0.0
+        if largest_gyro > s[LARGEST_GYRO]:
+            s[LARGEST_GYRO], s[CLIPPED] = largest_gyro, 0.0
+        if largest_accel > s[LARGEST_ACCEL]:
+            s[LARGEST_ACCEL], s[CLIPPED + 1] = largest_accel, 0.0
     s[BLIND] = 1.0 if saturated or s[SUSPECT] > 0.0 else 0.0
 
 
@@ -1288,8 +1289,9 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                 az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
                 rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
                 # An accelerometer that shakes three times as much as its noise says has more of it.
-                shaken = math.sqrt(s[CHANGE_ACCEL] / 6.0 * min(s[NEXT_T] - s[T_IMU], prm[IMU_GAP]))
-                force_noise = max(force_noise, shaken - 2.0 * prm[ACCEL_NOISE])
+                shaken2 = s[CHANGE_ACCEL] / 6.0 * min(s[NEXT_T] - s[T_IMU], prm[IMU_GAP])
+                if shaken2 > 9.0 * prm[ACCEL_NOISE] * prm[ACCEL_NOISE]:
+                    force_noise = max(force_noise, math.sqrt(shaken2) - 2.0 * prm[ACCEL_NOISE])
                 if s[BLIND] > 0.0:
                     # anything up to several times what it has ever said
                     rate_noise, force_noise = s[LARGEST_GYRO] * BLIND_TIME, s[LARGEST_ACCEL] * BLIND_TIME

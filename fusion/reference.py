@@ -248,7 +248,7 @@ class _State:
         self.adapted, self.t_adapted = 0.0, -math.inf
         self.t_wheel, self.wheel_rate, self.wheel_share = -math.inf, 0.0, 1.0
         self.wheel_nis, self.slips = [0.0, 0.0], False  # of speed, of yaw rate
-        self.force_mean, self.force_count = 0.0, 0
+        self.force2, self.force_count = 0.0, 0
         self.systematic = np.zeros(36)
         self.place, self.place2, self.place_count = np.zeros(3), np.zeros(3), 0
 
@@ -504,46 +504,51 @@ class ReferenceTimeline:
 
     def _head_for(self, state: _State, sample: tuple[float, ...]) -> None:
         """See `kernels._next_sample`."""
-        state.next_t, state.next_u = sample[0], np.array(sample[1:])
-        size = min(float(np.linalg.norm(state.next_u[3:])), 10.0 * GRAVITY)
-        if self._motion != "free" and state.force_count and abs(state.force_mean / GRAVITY - 1.0) > k.WRONG_SCALE:
-            state.next_u[3:] *= GRAVITY / max(state.force_mean, 0.01 * GRAVITY)
-        change = (state.next_u - state.u).reshape(2, 3)
-        squared = (change * change).sum(axis=1).tolist()
-        state.clipped = list(state.clipped)
-        saturated = False
-        for i, least in enumerate((k.SATURATED_GYRO, k.SATURATED_ACCEL)):
-            for axis in range(3):
-                if change[i, axis] == 0.0 and abs(state.u[3 * i + axis]) >= max(state.largest[i], least):
-                    state.clipped[i] += 1
-                    saturated |= state.clipped[i] >= k.CLIPPED_OFTEN
-        state.same_run = state.same_run + 1
-        if change.any():
+        state.next_t = sample[0]
+        rate, read = sample[1:4], sample[4:]
+        force2 = sum([f * f for f in read])
+        scale = 1.0
+        if self._motion != "free" and state.force_count and not k.LEAST_FORCE2 < state.force2 < k.MOST_FORCE2:
+            scale = GRAVITY / math.sqrt(max(state.force2, 1e-4 * GRAVITY**2))
+        force = [scale * f for f in read]
+        u = state.u.tolist()
+        changes = ([a - b for a, b in zip(rate, u, strict=False)], [a - b for a, b in zip(force, u[3:], strict=True)])
+        squared = [sum([c * c for c in change]) for change in changes]
+        clipped, saturated = list(state.clipped), False
+        largest = [max(map(abs, rate)), max(map(abs, force))]
+        for i, (change, now, least) in enumerate(
+            zip(changes, (rate, force), (k.SATURATED_GYRO, k.SATURATED_ACCEL), strict=True)
+        ):
+            if 0.0 in change:
+                for c, value in zip(change, now, strict=True):
+                    if c == 0.0 and abs(value) >= max(state.largest[i], least):
+                        clipped[i] += 1
+                        saturated |= clipped[i] >= k.CLIPPED_OFTEN
+        state.same_run += 1
+        if squared[0] + squared[1]:
             state.same_run = 0
             state.force_count = min(state.force_count + 1, k.FORCE_SAMPLES)
-            state.force_mean += (size - state.force_mean) / state.force_count
+            state.force2 += (min(force2, 100.0 * GRAVITY**2) - state.force2) / state.force_count
         state.bridging = sample[0] - state.t_imu > self._params.imu_gap or state.same_run >= k.STUCK_AFTER
         known = state.largest[1] > 0.0
         # of both sensors: what one sample alone may change by, and what none can
-        limits = zip(
-            squared, state.change, (k.SPIKE_GYRO, k.SPIKE_ACCEL), (k.IMPOSSIBLE_GYRO, k.IMPOSSIBLE_ACCEL), strict=True
-        )
-        spike = impossible = False
-        for square, usual, least, most in limits:
-            spike |= square > max(k.SPIKE**2 * usual, least**2)
-            impossible |= square > most**2
-        if impossible or (spike and not state.suspect and known):
+        spike = squared[0] > max(k.SPIKE**2 * state.change[0], k.SPIKE_GYRO**2)
+        spike |= squared[1] > max(k.SPIKE**2 * state.change[1], k.SPIKE_ACCEL**2)
+        if (
+            squared[0] > k.IMPOSSIBLE_GYRO**2
+            or squared[1] > k.IMPOSSIBLE_ACCEL**2
+            or (spike and not state.suspect and known)
+        ):
             state.suspect = True
             state.next_u = state.u
         else:
             state.suspect = False
+            state.next_u = np.array([*rate, *force])
             if known:
                 state.change = [c + 0.02 * (square - c) for c, square in zip(state.change, squared, strict=True)]
-            largest = np.abs(state.next_u).reshape(2, 3).max(axis=1).tolist()
-            state.clipped = [
-                0 if new > old else c for new, old, c in zip(largest, state.largest, state.clipped, strict=True)
-            ]
+            clipped = [0 if new > old else c for new, old, c in zip(largest, state.largest, clipped, strict=True)]
             state.largest = [max(new, old) for new, old in zip(largest, state.largest, strict=True)]
+        state.clipped = clipped
         state.blind = saturated or state.suspect
 
     def _advance(self, state: _State, until: float, live: bool) -> None:
