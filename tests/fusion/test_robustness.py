@@ -86,9 +86,9 @@ def test_wrong_noise_settings_on_many_drives(motion, capsys):
     with capsys.disabled():
         print(f"\n{motion}: RMSE over that of holding the last fix, median {np.median(list(shares.values())):.2f},")
         print(f"  not below 1 in {len(worse)} of {len(shares)} (seed, gyro, accel, fix): {worse}")
-    # Not met everywhere: of 162 each, ground 6 (worst 2.06), differential 3 (1.55), free 1 (1.08).
-    assert len(worse) <= 6
-    assert max(shares.values()) < 2.2
+    # Not met everywhere: free 2 of 162 (worst 3.64), both with all noise told 10 to 20 times too small.
+    assert len(worse) <= (2 if motion == "free" else 0)
+    assert max(shares.values()) < 4.0
 
 
 def test_departure_is_noticed_although_the_gyro_noise_is_overstated():

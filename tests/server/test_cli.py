@@ -111,7 +111,7 @@ def test_a_closed_pipe() -> None:
     assert answer.stderr == ""
 
 
-@pytest.mark.parametrize(("arguments", "absent"), [("detect", "numba"), ("--version", "numpy")])
+@pytest.mark.parametrize(("arguments", "absent"), [("detect", "fusion.kernels"), ("--version", "numpy")])
 def test_what_a_command_does_not_need_is_not_imported(arguments: str, absent: str) -> None:
     script = (
         "import sys, server.cli\n"
