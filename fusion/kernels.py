@@ -221,7 +221,7 @@ IMPOSSIBLE_GYRO, IMPOSSIBLE_ACCEL = (
 )  # rad/s, m/s2: more than a sensor of 4000 deg/s and 50 g can change by
 SATURATED_GYRO, SATURATED_ACCEL = 2.0, 15.0  # rad/s, m/s2: no sensor's range is smaller
 CLIPPED_OFTEN = 3  # times the very largest reading twice in a row: that is where it saturates
-TIME_OFFSET_WALK = 1e-3  # s/√s: a camera that has connected anew has another
+TIME_OFFSET_WALK = 5e-4  # s/√s: a camera that has connected anew has another
 PLACE_TIME = 5.0  # s: for so long a robot keeps to a part of its usual place
 PLACE_FIXES = 120  # so many fixes say what that is
 LEAST_PLACE = 0.3  # m: and it is no smaller than this
