@@ -66,6 +66,9 @@ CLOCK_UNITS = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"
 # s between the arrivals of batches that are those of an FTDI's latency timer; others are as the device makes them.
 LATENCY_TIMER = (0.012, 0.020)
 
+# A finding that only who has the sensor in hand can judge: a robot that drives even circles looks the same.
+TURNS_AT_REST = "gyro_at_rest"
+
 
 class Finding(NamedTuple):
     """As a `fusion.diagnosis.Diagnosis`, whose codes these share where they mean the same."""
@@ -323,7 +326,7 @@ def _of_rates(rows: Array, rest: Rest | None) -> Iterator[Finding]:
                 f"the accelerometer is at rest and the gyroscope reads {mean:.2f}: these are deg/s, not rad/s, or it "
                 "turns evenly, or its bias is very large"
             )
-            yield Finding("gyro_unit", "warning", text, {"noise": noise, "mean": mean})
+            yield Finding(TURNS_AT_REST, "warning", text, {"noise": noise, "mean": mean})
     if turning is None or not turning.agreement < TURN_DISAGREE:
         return
     evidence = {"agreement": turning.agreement, "rotation_deg": math.degrees(turning.total)}

@@ -15,7 +15,7 @@ from fusion.health import Health
 from fusion.localiser import Localiser
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix, WheelOdometry
 from imu.clock import DeviceClock, Reading
-from imu.health import StreamHealth
+from imu.health import TURNS_AT_REST, StreamHealth
 from imu.mounting import BodyReadings
 from imu.protocols import Parser
 from server.config import RobotConfig
@@ -145,7 +145,7 @@ class Robot:
     def diagnose(self, now: float) -> list[str]:
         """Bring `diagnoses` up to date. -> what is new, for the log: each once when it comes and when it goes."""
         self.diagnoses = self.vitals.diagnoses(now)
-        said = {diagnosis.code for diagnosis in self.diagnoses}
+        said = {diagnosis.code for diagnosis in self.diagnoses} | {TURNS_AT_REST}
         # What needs no fixes to be seen, of an IMU that is not long gone.
         findings = self.stream.findings() if now - self.heard < GONE_AFTER else []
         for diagnosis in (Diagnosis(*finding) for finding in findings if finding.code not in said):

@@ -130,7 +130,7 @@ def biased(readings: Array) -> None:
         (stuck, "imu_stuck", "error", "the sensor repeats itself: "),
         (frozen_gyro, "imu_stuck", "warning", "the gyroscope repeats itself: 0, 0, 0 for the last 400 samples"),
         (repeated, "imu_repeats", "warning", "50% of the readings are the ones before"),
-        (biased, "gyro_unit", "warning", "the gyroscope reads 0.50: these are deg/s, not rad/s, or it turns evenly"),
+        (biased, "gyro_at_rest", "warning", "the gyroscope reads 0.50: these are deg/s, not rad/s, or it turns evenly"),
     ],
 )
 def test_mistakes_that_are_seen_at_rest(wrong: Callable[[Array], None], code: str, severity: str, says: str) -> None:
