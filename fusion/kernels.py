@@ -78,6 +78,8 @@ MOVING_GYRO, MOVING_ACCEL = AUX + 56, AUX + 57  # mean variance of a window in m
 STILL_SURE = AUX + 58  # 1 where rest and motion differ in that
 USUAL_SPEED2 = AUX + 59  # (m/s)^2: mean squared speed along an axis while the robot moves
 REJECTED_RUN = AUX + 60  # rejects since the last accepted fix
+ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
+T_ADAPTED = AUX + 62  # s: the last of them
 WHEEL_CURSOR = AUX + 63  # number of the next wheel reading to come
 T_WHEEL = AUX + 64  # s: stamp of the last one
 WHEEL_RATE = AUX + 65  # rad/s: its yaw rate, by its scale
@@ -88,18 +90,16 @@ LARGEST_GYRO, LARGEST_ACCEL = AUX + 71, AUX + 72  # magnitude along an axis
 SUSPECT = AUX + 73  # 1 where the last sample was held to be lost
 BLIND = AUX + 74  # 1 while what the IMU says is not what the robot does
 GRID_AT = AUX + 75  # number of the last step of the grid
+PLACE = AUX + 76  # m: mean of where fixes have found it (3)
+PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (3)
+PLACE_COUNT = AUX + 82
+CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
 STILL_FORCE = AUX + 85  # m/s2: mean specific force since it is at rest (3)
 SYSTEMATIC = AUX + 88  # covariance of what the last fix taken had wrong in common with all others, world axes (36)
 TWINS = AUX + 124  # 1 while the shadow is the other pose of the first fix
 LEAD = AUX + 125  # by how much the scores of the fixes since then favour the filter over it
 FORCE2 = AUX + 126  # (m/s2)^2: mean square of the specific force,
 FORCE_COUNT = AUX + 127  # over so many samples
-CLIPPED = AUX + 83  # so often it has repeated the largest of its readings, gyroscope and accelerometer (2)
-PLACE = AUX + 76  # m: mean of where fixes have found it (3)
-PLACE2 = AUX + 79  # m2: their mean squared distance from that along each axis (3)
-PLACE_COUNT = AUX + 82
-ADAPTED = AUX + 61  # fixes that the noise has learnt from, of those in quick succession a part
-T_ADAPTED = AUX + 62  # s: the last of them
 STATE = AUX + 128
 
 # --- The smooth channel: the pose that robots steer by is the filter's, moved by E; not part of what rewinds --------
@@ -836,8 +836,9 @@ def _judge(s, prm, fix):
     The way back: a rejected fix starts a shadow filter, which runs on the same IMU and takes the rejects that follow.
     When enough in a row agree with it, and its attitude with the gyro's, it takes over. A marker entered wrongly in
     the map gives long runs that agree with each other but not with the gyro; those must last longer than any such run.
-    Twice as many in a row that do not even agree with each other, but are not turned either, and any at all after that
-    long without an accepted one, set the filter anew from the last: it is never locked out for good.
+    Twice as many in a row that do not even agree with each other, unless they are only turned, and any at all after
+    that long without an accepted one, set the filter anew from the last: it is never locked out for good.
+    A fix of which only the attitude fails is taken with its position alone, and counts as a reject for the way back.
     """
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     if s[TWINS] > 0.0:
@@ -1471,7 +1472,7 @@ def _plausible(meta, prm, t):
 def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
     """Put a reading of the IMU, or of the wheels, in its place in the ring, and rewind the state if need be.
 
-    `counters`: meta from the ring's own on: first, end; then repeated and late ones. False: it was dropped.
+    `counters`: where in meta the ring's first and end stand. `imu`: whose ring it is. False: it was dropped.
     """
     t = reading[0]
     if not _plausible(meta, prm, t):

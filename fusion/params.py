@@ -1,4 +1,4 @@
-"""Every tunable number of the filter: unit, meaning, default, source. SI units and radians.
+"""Every number of the filter that a configuration can set: unit, meaning, default, source. SI units and radians.
 
 Densities are of continuous white noise: the variance of an integral over `dt` seconds is `density**2 * dt`.
 """
