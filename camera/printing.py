@@ -76,7 +76,7 @@ def print_markers(
         least = next((name for name, sizes in PAPERS.items() if _fits(wide, high, *sizes)), None)
         advice = f"--paper {least}" if least else "a smaller one"
         raise PrintError(
-            f"a marker of {side:g} mm with its white margin of {margin:g} mm does not fit on {paper}: take {advice}"
+            f"a marker of {side:g} mm with its white margin of {margin:.3g} mm does not fit on {paper}: take {advice}"
         )
     left, top = 0.5 * (width - across * wide), height - _EDGE
 
