@@ -605,8 +605,9 @@ def _weigh(s, o, prm, fix, H, y, R, S):
 
         y_p = R̂ᵀ(z_p - p̂) = δp + R̂ᵀv δt_d,    y_θ = Log(R̂ᵀ R_z) = δθ + ω δt_d
 
-    R is the fix's covariance turned from world into body axes, and the stamp's jitter along the motion. The score of
-    a hypothesis is d² + log|S| + misfit: twice the negative log-likelihood of the pose and of the pixels.
+    R is the fix's covariance turned from world into body axes, the stamp's jitter along the motion, and δv δt_d, what
+    H leaves out: at the second fix neither the speed nor the offset is known. The score of a hypothesis is
+    d² + log|S| + misfit: twice the negative log-likelihood of the pose and of the pixels.
     -> that of the chosen one.
     """
     B = np.empty((3, 3))
@@ -650,6 +651,8 @@ def _weigh(s, o, prm, fix, H, y, R, S):
                     total += unsure * (B[0, i - 3] * B[0, j - 3] + B[1, i - 3] * B[1, j - 3])
                 if (i < 3) == (j < 3):
                     total *= s[SCALE + 2 + i // 3]
+                if i < 3 and j < 3:
+                    total += s[o + COV + N * (DV + i) + DV + j] * s[o + COV + (N + 1) * DTD]
                 R[i, j] = total
                 # H P Hᵀ: row and column i of P are where H has its 1, DTD where it has its motion
                 a = o + COV + N * ((DP if i < 3 else TH - 3) + i)
@@ -679,8 +682,12 @@ def _weigh(s, o, prm, fix, H, y, R, S):
 
 
 @_jit
-def _start(f, prm, fix, k, afresh):
-    """Pose and covariance of the filter f (BLOCK,) from the hypothesis at fix[k:]; the rest stays, or starts afresh."""
+def _start(s, o, prm, fix, k, afresh):
+    """Pose and covariance of the filter at s[o:] from the hypothesis at fix[k:]; the rest stays, or starts afresh.
+
+    The fix is of stamp + t_d: what is unknown of that has turned the pose, δθ = -ω δt_d beside the fix's own error.
+    """
+    f = s[o : o + BLOCK]
     c = COV
     if afresh:
         for i in range(BLOCK):
@@ -712,6 +719,15 @@ def _start(f, prm, fix, k, afresh):
                 for n in range(3):
                     total += B[m, i % 3] * fix[k + H_COV + 6 * (3 * (i // 3) + m) + 3 * (j // 3) + n] * B[n, j % 3]
             f[c + N * (DP - 6 * (i // 3) + i % 3) + DP - 6 * (j // 3) + j % 3] = total
+    rate = np.zeros(3)
+    if s[BRIDGING] == 0.0:
+        for i in range(3):
+            rate[i] = s[U + i] - f[BG + i]
+    for i in range(3):
+        for j in range(3):
+            f[c + N * i + j] += rate[i] * rate[j] * f[c + (N + 1) * DTD]
+        for j in range(DBG, N):
+            f[c + N * i + j] = f[c + N * j + i] = -rate[i] * f[c + N * DTD + j]
     most = UNKNOWN_HEADING * UNKNOWN_HEADING
     if max(f[c], f[c + N + 1], f[c + 2 * (N + 1)]) > most:
         # The fix says nothing of the attitude.
@@ -770,7 +786,7 @@ def _initialise(s, prm, fix):
         other = count > 1 and (score[1] < score[0]) != (h == 1)
         o = BLOCK * h
         k = F_HYPOTHESES + (HYPOTHESIS if other else 0)
-        _start(s[o : o + BLOCK], prm, fix, k, s[INITIALISED] == 0.0)
+        _start(s, o, prm, fix, k, s[INITIALISED] == 0.0)
         if h == 0:
             _fill(s[SYSTEMATIC : SYSTEMATIC + 36], fix[k + H_SYSTEMATIC :])
         if s[ACCEL_COUNT] > 0.0:
@@ -845,8 +861,6 @@ def _judge(s, prm, fix):
         # Which of the first fix's poses was it? Both go on until that is clear, the likelier one as the filter.
         s[LEAD] -= _weigh(s, MAIN, prm, fix, H, y, R, S)
         s[LEAD] += _weigh(s, SHADOW, prm, fix, H, y, R, S)
-        if fix[F_D2] <= prm[GATE] * prm[GATE_INFLATION]:
-            update(s[SHADOW:AUX], H, y, R)
         if s[LEAD] < 0.0:
             s[LEAD] = -s[LEAD]
             for i in range(BLOCK):
@@ -855,13 +869,18 @@ def _judge(s, prm, fix):
                 s[SHADOW + i] = swap
         if s[LEAD] > CLEAR_LEAD:
             s[TWINS] = s[SHADOW_COUNT] = 0.0
+        else:
+            # only now is it known which of the two is not the filter, which takes the fix below
+            _weigh(s, SHADOW, prm, fix, H, y, R, S)
+            if fix[F_D2] <= prm[GATE] * prm[GATE_INFLATION]:
+                update(s[SHADOW:AUX], H, y, R)
     shadows = s[SHADOW_COUNT] > 0.0 and s[TWINS] == 0.0
     agrees, partly = False, False
     figures = np.empty(F_REPORTED - F_D2)
     if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
         # After so long without an IMU nothing is left to weigh the fix by.
         _weigh(s, MAIN, prm, fix, H, y, R, S)
-        _start(s[:BLOCK], prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, False)
+        _start(s, MAIN, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, False)
         _restarted(s, prm, fix, 1.0)
         return
     for o in range(MAIN, SHADOW + 1 if shadows else SHADOW, BLOCK):
@@ -958,7 +977,7 @@ def _judge(s, prm, fix):
     else:
         _fill(s[SHADOW:AUX], s)
         # A filter that only its first fixes vouch for has no biases worth keeping.
-        _start(s[SHADOW:AUX], prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
+        _start(s, SHADOW, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
         s[SHADOW_COUNT] = 1.0
         # Not even with each other do they agree, so many in a row: then any is better than none of them.
         take = patient or (s[REJECTED_RUN] >= 2.0 * prm[REINIT_COUNT] and not (turned and partly))

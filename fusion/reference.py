@@ -162,8 +162,8 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         R = self.rotation.dot(exp)
         self.rotation = R.dot(1.5 * _I3 - 0.5 * R.T.dot(R))
 
-    def start(self, hypothesis: Array, velocity_sigma: float) -> None:
-        """Pose and its covariance from a fix; the other states stay, uncorrelated with it."""
+    def start(self, hypothesis: Array, velocity_sigma: float, rate: Array) -> None:
+        """Pose and its covariance from a fix, turning at `rate` (3,); the other states stay."""
         self.rotation = rotation_from_quaternion(hypothesis[k.H_QUAT : k.H_QUAT + 4])
         self.position = hypothesis[k.H_POS : k.H_POS + 3].copy()
         self.velocity = np.zeros(3)
@@ -174,6 +174,10 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         R = self._in_body(hypothesis)
         P[DP, DP], P[TH, TH] = R[:3, :3], R[3:, 3:]
         P[DP, TH], P[TH, DP] = R[:3, 3:], R[3:, :3]
+        # off by -ω δt_d beside the fix's own error
+        P[TH, TH] += P[DTD, DTD] * np.outer(rate, rate)
+        P[TH, 9:] = -np.outer(rate, P[DTD, 9:])
+        P[9:, TH] = P[TH, 9:].T
         if P.diagonal()[TH].max() > k.UNKNOWN_HEADING**2:
             # the fix says nothing of the attitude
             P[TH, :] = P[:, TH] = 0.0
@@ -677,7 +681,7 @@ class ReferenceTimeline:
         """A filter that starts from a pose, its tilt corrected by gravity."""
         f = ErrorStateFilter()
         f.P = self._prior()
-        f.start(hypothesis, self._params.velocity_sigma)
+        f.start(hypothesis, self._params.velocity_sigma, self._rate(state, f))
         if state.accel_count:
             force = GRAVITY * f.rotation.T @ f.up
             H = np.zeros((3, N))
@@ -696,11 +700,11 @@ class ReferenceTimeline:
 
     def _score(self, state: _State, f: ErrorStateFilter, fix: Array) -> float:
         """Of the hypothesis that fits a filter best, see `kernels._weigh`."""
-        rate = np.zeros(3) if state.bridging else state.u[:3] - f.gyro_bias
+        rate = self._rate(state, f)
         scores = []
         for i in range(int(fix[k.F_COUNT])):
             H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
-            S = H @ f.P @ H.T + self._rescaled(state, R)
+            S = H @ f.P @ H.T + self._noise(state, f, R)
             scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
         return float(min(scores))
 
@@ -709,23 +713,25 @@ class ReferenceTimeline:
         p, other = self._params, state.shadow
         assert other is not None
         state.lead += self._score(state, other, fix) - self._score(state, state.main, fix)
+        if state.lead < 0.0:
+            state.lead = -state.lead
+            state.main, other = other, state.main
+            state.shadow = other
+        if state.lead > k.CLEAR_LEAD:
+            state.twins, state.shadow, state.shadow_count = False, None, 0
+            return
         H, y, R, _ = self._weigh(state, other, fix)
         if fix[k.F_D2] <= p.gate * p.gate_inflation:
             other.correct(H, y, R)
-        if state.lead < 0.0:
-            state.lead = -state.lead
-            state.main, state.shadow = other, state.main
-        if state.lead > k.CLEAR_LEAD:
-            state.twins, state.shadow, state.shadow_count = False, None, 0
 
     def _weigh(self, state: _State, f: ErrorStateFilter, fix: Array) -> tuple[Array, Array, Array, Array]:
         """Choose the hypothesis, write the fix's figures. -> H, y, R, S."""
-        rate = np.zeros(3) if state.bridging else state.u[:3] - f.gyro_bias
+        rate = self._rate(state, f)
         scores, models = [], []
         for i in range(int(fix[k.F_COUNT])):
             H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
             models.append((H, y, R))
-            S = H @ f.P @ H.T + self._rescaled(state, R)
+            S = H @ f.P @ H.T + self._noise(state, f, R)
             scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
         chosen = int(np.argmin(scores))
         margin = abs(scores[0] - scores[1]) if len(scores) == 2 else math.inf
@@ -733,7 +739,7 @@ class ReferenceTimeline:
         if margin < self._params.hypothesis_margin:
             B = f.rotation
             R[3:, 3:] += k.UNKNOWN_TILT_SIGMA**2 * (np.outer(B[0], B[0]) + np.outer(B[1], B[1]))
-        R = self._rescaled(state, R)
+        R = self._noise(state, f, R)
         S = H @ f.P @ H.T + R
         fix[k.F_D2] = _d2(S, y)
         fix[k.F_D2_POSITION] = _d2(S[:3, :3], y[:3])
@@ -745,9 +751,14 @@ class ReferenceTimeline:
         return H, y, R, S
 
     @staticmethod
-    def _rescaled(state: _State, R: Array) -> Array:
+    def _rate(state: _State, f: ErrorStateFilter) -> Array:
+        return np.zeros(3) if state.bridging else state.u[:3] - f.gyro_bias
+
+    @staticmethod
+    def _noise(state: _State, f: ErrorStateFilter, R: Array) -> Array:
+        """R by its scale, and the product of the errors of speed and time offset, which H leaves out."""
         R = R.copy()
-        R[:3, :3] *= state.scale[2]
+        R[:3, :3] = state.scale[2] * R[:3, :3] + f.P[DTD, DTD] * f.P[DV, DV]
         R[3:, 3:] *= state.scale[3]
         return R
 
@@ -790,7 +801,7 @@ class ReferenceTimeline:
         H, y, R, S = self._weigh(state, main, fix)
         if main.P.diagonal()[TH].max() > 2.0 * k.UNKNOWN_HEADING**2:
             # after so long without an IMU nothing is left to weigh the fix by
-            main.start(self._chosen(fix), p.velocity_sigma)
+            main.start(self._chosen(fix), p.velocity_sigma, self._rate(state, main))
             self._restarted(state, fix, 1)
             return
         ratio = self._gate_ratio(fix)
@@ -861,7 +872,7 @@ class ReferenceTimeline:
             if not known:
                 shadow = ErrorStateFilter()
                 shadow.P = self._prior()
-            shadow.start(self._chosen(fix), p.velocity_sigma)
+            shadow.start(self._chosen(fix), p.velocity_sigma, self._rate(state, shadow))
             state.shadow, state.shadow_count = shadow, 1
             take = patient or (state.rejected_run >= 2 * p.reinit_count and not (turned and partly))
         if take:
