@@ -43,7 +43,11 @@ COV = 21
 N = 20
 TH, DV, DP, DBG, DBA, DTD, DTILT, DWHEEL = 0, 3, 6, 9, 12, 15, 16, 18
 CORRECTED = COV + N * N  # sum of all moves by updates, world axes: position (3), rotation vector (3)
-BLOCK = CORRECTED + 6
+# P lags behind the nominal state by so many seconds, which began at this attitude and velocity; white noise has since
+# been added to attitude and velocity along each axis, rad2 and (m/s)2.
+LAG = CORRECTED + 6
+Q_THEN, V_THEN, ANGLE_VARIANCE, VELOCITY_VARIANCE = LAG + 1, LAG + 5, LAG + 8, LAG + 9
+BLOCK = LAG + 10
 
 # --- The whole state of a robot: the filter, a second one that grows from rejected fixes, and bookkeeping ---------
 MAIN, SHADOW, AUX = 0, BLOCK, 2 * BLOCK
@@ -189,6 +193,7 @@ P_T_ACCEPTED, P_RESET_ID, P_T_IMU = 59, 60, 61
 P_STEP = 62  # of the last reset: position (3), rotation vector (3), world
 POSE = 68
 
+LONGEST_LAG = 0.018  # s: of the covariance behind the state: four samples at 200 Hz
 GRID_HZ = 10.0  # pseudo-measurements come on a fixed grid of time, so that late fixes do not move them
 SPEED_TIME = 2.0  # s: for so long a robot keeps its speed
 LEAST_SPEED = 0.1  # m/s, along an axis: less is not learnt as usual
@@ -301,48 +306,41 @@ def _fill(a, b):
 # ---------------------------------------------------------------------------------------------------------- filter
 
 
-@_fused
-def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_walk, accel_bias_walk):
-    """Carry the filter f (BLOCK,) over `dt` s of constant angular rate and specific force, both raw.
-
-    With Δv, Δp what specific force adds to velocity and position, in the body axes at the *start*, A = Exp(-ω dt) and
-    C = -g dt R̂ᵀ∂u/∂c, u = (c, √(1 - c²)) the vertical, the error goes, up to O(dt²),
-
-        δθ' = A (δθ - dt δbg)
-        δv' = A (δv - Δv × δθ - dt δba + C δc)
-        δp' = A (δp + dt δv - Δp × δθ - dt²/2 δba + dt/2 C δc)
-
-    which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
-    A drops out of Q.
-
-    The filter is an array of its own here: with an offset in the index the loops over P are not vectorised.
-    """
+@_inline
+def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise):
+    """Carry the nominal state of the filter f (BLOCK,) over `dt` s of constant angular rate and specific force, both
+    raw. What that does to P waits for `spread`."""
     wx, wy, wz = gx - f[BG], gy - f[BG + 1], gz - f[BG + 2]
     fx, fy, fz = ax - f[BA], ay - f[BA + 1], az - f[BA + 2]
     qw, qx, qy, qz = f[0], f[1], f[2], f[3]
+    if f[LAG] == 0.0:
+        for i in range(7):
+            f[Q_THEN + i] = f[i]  # attitude and velocity
+    f[LAG] += dt
+    f[ANGLE_VARIANCE] += gyro_noise * gyro_noise * dt
+    f[VELOCITY_VARIANCE] += accel_noise * accel_noise * dt
     # quaternion of half the rotation: cos and sin of a quarter of the angle
-    h = 0.5 * dt
-    quarter = 0.5 * h * math.sqrt(wx * wx + wy * wy + wz * wz)
-    if quarter < 1e-4:
-        hw, h2 = 1.0 - 0.5 * quarter * quarter, 0.5 * h * (1.0 - quarter * quarter / 6.0)
+    quarter2 = dt * dt * (wx * wx + wy * wy + wz * wz) / 16.0
+    if quarter2 < 2e-3:
+        # to the last digit, and several times faster
+        hw = 1.0 - quarter2 / 2.0 * (1.0 - quarter2 / 12.0 * (1.0 - quarter2 / 30.0 * (1.0 - quarter2 / 56.0)))
+        h2 = 0.25 * dt * (1.0 - quarter2 / 6.0 * (1.0 - quarter2 / 20.0 * (1.0 - quarter2 / 42.0)))
     else:
-        hw, h2 = math.cos(quarter), math.sin(quarter) / quarter * 0.5 * h
+        quarter = math.sqrt(quarter2)
+        hw, h2 = math.cos(quarter), math.sin(quarter) / quarter * 0.25 * dt
     hx, hy, hz = h2 * wx, h2 * wy, h2 * wz
     # Δv: the specific force of the midpoint, in start axes
     tx, ty, tz = 2.0 * (hy * fz - hz * fy), 2.0 * (hz * fx - hx * fz), 2.0 * (hx * fy - hy * fx)
     d0 = (fx + hw * tx + hy * tz - hz * ty) * dt
     d1 = (fy + hw * ty + hz * tx - hx * tz) * dt
     d2 = (fz + hw * tz + hx * ty - hy * tx) * dt
-
-    r00, r01, r02 = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
-    r10, r11, r12 = 2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)
-    r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
+    # turned by q, and gravity
+    tx, ty, tz = 2.0 * (qy * d2 - qz * d1), 2.0 * (qz * d0 - qx * d2), 2.0 * (qx * d1 - qy * d0)
     c0, c1 = f[TILT], f[TILT + 1]
     g = -GRAVITY * dt
-    k0 = r00 * d0 + r01 * d1 + r02 * d2 + g * c0
-    k1 = r10 * d0 + r11 * d1 + r12 * d2 + g * c1
-    c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
-    k2 = r20 * d0 + r21 * d1 + r22 * d2 + g * c2
+    k0 = d0 + qw * tx + qy * tz - qz * ty + g * c0
+    k1 = d1 + qw * ty + qz * tx - qx * tz + g * c1
+    k2 = d2 + qw * tz + qx * ty - qy * tx + g * math.sqrt(1.0 - c0 * c0 - c1 * c1)
     f[POS] += (f[V] + 0.5 * k0) * dt
     f[POS + 1] += (f[V + 1] + 0.5 * k1) * dt
     f[POS + 2] += (f[V + 2] + 0.5 * k2) * dt
@@ -358,12 +356,46 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_wa
     scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
     f[0], f[1], f[2], f[3] = nw * scale, nx * scale, ny * scale, nz * scale
 
-    a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
-    a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
-    a02, a12, a22 = 2.0 * (ex * ez - ew * ey), 2.0 * (ey * ez + ew * ex), 1.0 - 2.0 * (ex * ex + ey * ey)
+
+@_fused
+def spread(f, gyro_bias_walk, accel_bias_walk):
+    """Bring P of the filter f (BLOCK,) up to the nominal state: over `LAG` seconds, several samples at once.
+
+    With Δv, Δp what specific force has added to velocity and position, in the body axes at the *start*, A = R̂ᵀR̂_start
+    and C = -g dt R̂_startᵀ∂u/∂c, u = (c, √(1 - c²)) the vertical, the error goes, up to O(dt²),
+
+        δθ' = A (δθ - dt δbg)
+        δv' = A (δv - Δv × δθ - dt δba + C δc)
+        δp' = A (δp + dt δv - Δp × δθ - dt²/2 δba + dt/2 C δc)
+
+    which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
+    A drops out of Q.
+
+    The filter is an array of its own here: with an offset in the index the loops over P are not vectorised.
+    """
+    dt = f[LAG]
+    if dt == 0.0:
+        return
+    h = 0.5 * dt
+    qw, qx, qy, qz = f[Q_THEN], f[Q_THEN + 1], f[Q_THEN + 2], f[Q_THEN + 3]
+    r00, r01, r02 = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
+    r10, r11, r12 = 2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)
+    r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
+    c0, c1 = f[TILT], f[TILT + 1]
+    c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
+    g = -GRAVITY * dt
+    k0, k1, k2 = f[V] - f[V_THEN] - g * c0, f[V + 1] - f[V_THEN + 1] - g * c1, f[V + 2] - f[V_THEN + 2] - g * c2
+    d0, d1, d2 = r00 * k0 + r10 * k1 + r20 * k2, r01 * k0 + r11 * k1 + r21 * k2, r02 * k0 + r12 * k1 + r22 * k2
     t0, t1 = c0 / c2, c1 / c2
     c00, c10, c20 = g * (r00 - t0 * r20), g * (r01 - t0 * r21), g * (r02 - t0 * r22)
     c01, c11, c21 = g * (r10 - t1 * r20), g * (r11 - t1 * r21), g * (r12 - t1 * r22)
+    # the turn since then, q_then⁻¹ q
+    w, x, y, z = f[0], f[1], f[2], f[3]
+    ew, ex = qw * w + qx * x + qy * y + qz * z, qw * x - qx * w - qy * z + qz * y
+    ey, ez = qw * y + qx * z - qy * w - qz * x, qw * z - qx * y + qy * x - qz * w
+    a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
+    a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
+    a02, a12, a22 = 2.0 * (ex * ez - ew * ey), 2.0 * (ey * ez + ew * ex), 1.0 - 2.0 * (ex * ex + ey * ey)
     c = COV
     # F P Fᵀ as F (F P)ᵀ: the same loop twice, over columns that lie side by side in memory. The second round is needed
     # for the first nine columns only, since F leaves the rest alone.
@@ -403,16 +435,15 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_wa
                 for j in range(9, N):
                     f[c + N * j + i] = f[c + N * i + j]
 
-    angle_noise = gyro_noise * gyro_noise * dt
-    velocity_noise = accel_noise * accel_noise * dt
     for i in range(3):
-        f[c + (N + 1) * (TH + i)] += angle_noise
-        f[c + (N + 1) * (DV + i)] += velocity_noise
-        f[c + (N + 1) * (DP + i)] += velocity_noise * dt * dt / 3.0
-        f[c + N * (DV + i) + DP + i] += velocity_noise * h
-        f[c + N * (DP + i) + DV + i] += velocity_noise * h
+        f[c + (N + 1) * (TH + i)] += f[ANGLE_VARIANCE]
+        f[c + (N + 1) * (DV + i)] += f[VELOCITY_VARIANCE]
+        f[c + (N + 1) * (DP + i)] += f[VELOCITY_VARIANCE] * dt * dt / 3.0
+        f[c + N * (DV + i) + DP + i] += f[VELOCITY_VARIANCE] * h
+        f[c + N * (DP + i) + DV + i] += f[VELOCITY_VARIANCE] * h
         f[c + (N + 1) * (DBG + i)] += gyro_bias_walk * gyro_bias_walk * dt
         f[c + (N + 1) * (DBA + i)] += accel_bias_walk * accel_bias_walk * dt
+    f[LAG] = f[ANGLE_VARIANCE] = f[VELOCITY_VARIANCE] = 0.0
 
 
 @_jit
@@ -843,8 +874,9 @@ def _judge(s, prm, fix):
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     if s[TWINS] > 0.0:
         # Which of the first fix's poses was it? Both go on until that is clear, the likelier one as the filter.
-        s[LEAD] -= _weigh(s, MAIN, prm, fix, H, y, R, S)
-        s[LEAD] += _weigh(s, SHADOW, prm, fix, H, y, R, S)
+        for o in range(MAIN, AUX, BLOCK):
+            score = _weigh(s, o, prm, fix, H, y, R, S)
+            s[LEAD] += score if o == SHADOW else -score
         if fix[F_D2] <= prm[GATE] * prm[GATE_INFLATION]:
             update(s[SHADOW:AUX], H, y, R)
         if s[LEAD] < 0.0:
@@ -858,14 +890,13 @@ def _judge(s, prm, fix):
     shadows = s[SHADOW_COUNT] > 0.0 and s[TWINS] == 0.0
     agrees, partly = False, False
     figures = np.empty(F_REPORTED - F_D2)
-    if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
-        # After so long without an IMU nothing is left to weigh the fix by.
-        _weigh(s, MAIN, prm, fix, H, y, R, S)
-        _start(s[:BLOCK], prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, False)
-        _restarted(s, prm, fix, 1.0)
-        return
     for o in range(MAIN, SHADOW + 1 if shadows else SHADOW, BLOCK):
         _weigh(s, o, prm, fix, H, y, R, S)
+        if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
+            # After so long without an IMU nothing is left to weigh the fix by.
+            _start(s[:BLOCK], prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, s[INITIALISED] == 0.0)
+            _restarted(s, prm, fix, 1.0)
+            return
         blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
         ratio = max(fix[F_D2] / prm[GATE], blocks)
         if o == MAIN:
@@ -1258,6 +1289,13 @@ def _next_sample(s, prm, imu, k):
 
 
 @_jit
+def _settle(s, prm):
+    """Bring the covariances up to T, for whatever reads or changes them."""
+    for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
+        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
+
+
+@_jit
 def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
     """Carry the state to t_end, on its way to the next sample, and take all that is due until then at its instant."""
     while True:
@@ -1315,11 +1353,9 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                         rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
                         if turns:
                             rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
-                    predict(
-                        s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt,
-                        rate_noise, force_noise, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK],
-                    )  # fmt: skip
+                    predict(s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt, rate_noise, force_noise)
                     if s[BRIDGING] > 0.0:
+                        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
                         _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
             if part == 1.0:
                 for i in range(6):
@@ -1328,6 +1364,8 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                 for i in range(6):
                     s[U + i] += part * (s[NEXT_U + i] - s[U + i])
             s[T] = t
+        if due != NOTHING or s[LAG] > LONGEST_LAG or math.floor(t * GRID_HZ) != s[GRID_AT]:
+            _settle(s, prm)
         if due == NOTHING:
             return
         if due == A_READING:
@@ -1468,16 +1506,17 @@ def _plausible(meta, prm, t):
     return False
 
 
-@_jit
-def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
+@_inline
+def _insert_row(s, prm, ring, checkpoints, meta, reading, imu):
     """Put a reading of the IMU, or of the wheels, in its place in the ring, and rewind the state if need be.
 
-    `counters`: where in meta the ring's first and end stand. `imu`: whose ring it is. False: it was dropped.
+    `imu`: whose ring it is. -> how many are kept of it: 1, or 0.
     """
     t = reading[0]
+    counters = IMU_FIRST if imu else WHEEL_FIRST
     if not _plausible(meta, prm, t):
         meta[IMU_LATE if imu else WHEEL_LATE] += 1.0
-        return False
+        return 0
     width, mask = ring.shape[1], ring.shape[0] - 1
     first, end = int(meta[counters]), int(meta[counters + 1])
     place = end
@@ -1493,11 +1532,11 @@ def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
                 replaces = a < b or math.isnan(b)
                 break
         if not replaces:
-            return False
+            return 0
     in_order = _precedes_sample(s, t, prm[IMU_GAP]) if imu else s[T] < t
     if (replaces or place < end or not in_order) and not _rewind(s, prm, checkpoints, meta, t, -1.0 if imu else -2.0):
         meta[IMU_LATE if imu else WHEEL_LATE] += 1.0
-        return False
+        return 0
     if replaces:
         place -= 1
     else:
@@ -1512,7 +1551,7 @@ def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
     if end - first == mask + 1:
         meta[counters] = first + 1
         _drop_orphans(checkpoints, meta)
-    return True
+    return 1
 
 
 @_jit
@@ -1634,12 +1673,10 @@ def _ahead(dt, age, gap):
 
 @_jit
 def _absorb(s, prm, ch, plain):
-    """Set E such that the smooth pose does not move by what an input has done to the filter's."""
-    moved = False
-    for i in range(6):
-        moved |= s[CORRECTED + i] != ch[BEFORE_CORRECTED + i]
-    if plain and not moved:
-        return
+    """Set E such that the smooth pose does not move by what an input has done to the filter's.
+
+    `plain`: by updates alone, in passing, not by a fix or by having done the past again.
+    """
     # Where both would have been at the latest instant that is known outside.
     at = s[T] if plain else min(max(ch[E_PUBLISHED], s[T]), s[T] + SMOOTH_REACH)
     if at > ch[E_T]:
@@ -1755,17 +1792,19 @@ def process(memory, task, channel, t, inputs, outputs):
                 ch[BEFORE + 4 + j] = state[Q + j]
             for j in range(6):
                 ch[BEFORE_CORRECTED + j] = state[CORRECTED + j]
-        if task == FEED_SAMPLES:
-            if _insert_row(state, prm, imu, IMU_FIRST, checkpoints, meta, inputs[i], True):
-                answer += 1
-        elif task == FEED_WHEELS:
-            if _insert_row(state, prm, wheels, WHEEL_FIRST, checkpoints, meta, inputs[i], False):
-                answer += 1
-        elif task == FEED_FIX:
+        if task == FEED_FIX:
             answer = _insert_fix(state, prm, fixes, checkpoints, meta, inputs[i])
+        elif live:
+            ring = imu if task == FEED_SAMPLES else wheels
+            answer += _insert_row(state, prm, ring, checkpoints, meta, inputs[i], task == FEED_SAMPLES)
         _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live)
         if live and started:
-            _absorb(state, prm, ch, meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor)
+            plain = meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor
+            moved = not plain
+            for j in range(6):
+                moved |= state[CORRECTED + j] != ch[BEFORE_CORRECTED + j]
+            if moved:
+                _absorb(state, prm, ch, plain)
         elif live:
             ch[E_T] = state[T]
         if task == FEED_SAMPLES and i < outputs.shape[0]:
@@ -1797,6 +1836,7 @@ def process(memory, task, channel, t, inputs, outputs):
     if not s[INITIALISED] > 0.0:
         return 0
     out = outputs[0]
+    _settle(s, prm)
     _write_pose(s, out)
     if channel == SMOOTH:
         out[P_RESET_ID] = ch[E_RESETS]

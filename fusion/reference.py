@@ -70,6 +70,8 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.wheel_scale = np.zeros(2)  # of wheel odometry: errors of forward speed and yaw rate
         self.lean(np.zeros(2))
         self.corrected = np.zeros(6)  # sum of all moves by updates: position, rotation vector, world axes
+        # P lags behind the nominal state, by so many s since this attitude and velocity; white noise (2,) added since
+        self.lag, self.then, self.white = 0.0, (self.rotation, self.velocity), (0.0, 0.0)
 
     def predict_x(self, u: Any = 0) -> None:
         """The error stays zero; `move` carries the nominal state."""
@@ -86,21 +88,28 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     def gyro_bias(self) -> Array:
         return self.bias[:3]
 
-    def move(self, u: Array, dt: float, noise: tuple[float, float, float, float]) -> None:
-        """Carry over `dt` s of constant rate and specific force u (6,), with its bias.
-
-        `noise`: densities of gyro, accel and their walks.
-        """
+    def move(self, u: Array, dt: float, gyro_noise: float, accel_noise: float) -> None:
+        """Carry the nominal state over `dt` s of constant rate and specific force u (6,), with its bias, of such noise
+        densities. What that does to P waits for `spread`."""
+        if self.lag == 0.0:
+            self.then = self.rotation, self.velocity
+        self.lag += dt
+        self.white = self.white[0] + gyro_noise**2 * dt, self.white[1] + accel_noise**2 * dt
         du = (u - self.bias) * dt
         half_turned = exp_so3(0.5 * du[:3])
-        turned = half_turned.dot(half_turned)
-        added = half_turned.dot(du[3:])  # Δv, in start axes
         start, velocity = self.rotation, self.velocity
-        self.rotation = start.dot(turned)
-        self.velocity = velocity + start.dot(added) - GRAVITY * dt * self.up
+        self.rotation = start.dot(half_turned).dot(half_turned)
+        self.velocity = velocity + start.dot(half_turned.dot(du[3:])) - GRAVITY * dt * self.up
         self.position = self.position + 0.5 * dt * (velocity + self.velocity)
 
-        A = turned.T  # end axes from start axes
+    def spread(self, gyro_walk: float, accel_walk: float) -> None:
+        """Bring P up to the nominal state; `gyro_walk`, `accel_walk`: densities of the biases' walks."""
+        dt = self.lag
+        if dt == 0.0:
+            return
+        start, velocity = self.then
+        A = self.rotation.T.dot(start)  # end axes from start axes
+        added = start.T.dot(self.velocity - velocity + GRAVITY * dt * self.up)  # Δv, in start axes
         A_dt = dt * A
         F = _I.copy()
         F[TH, TH] = F[DV, DV] = A
@@ -110,11 +119,11 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         F[DP] = 0.5 * dt * F[DV]  # the position goes by the mean of both velocities
         F[DP, DV] = A_dt
         F[DP, DP] = A
-        gyro_noise, accel_noise, gyro_walk, accel_walk = noise
-        angle, force = gyro_noise**2 * dt, accel_noise**2 * dt
+        angle, force = self.white
         variances = [angle, force, 0.5 * dt * force, dt * dt / 3.0 * force, gyro_walk**2 * dt, accel_walk**2 * dt]
         self.F, self.Q = F, np.array(variances).dot(_NOISE).reshape(N, N)
         self.predict()
+        self.lag, self.white = 0.0, (0.0, 0.0)
 
     def slow(self, dt: float, noise: float) -> None:
         """What `move` leaves out where nothing is measured: the speed decays, and white `noise` pushes the robot."""
@@ -417,6 +426,7 @@ class ReferenceTimeline:
                     self._run_to(state, leg, fixes, readings)
         if not state.initialised:
             return None
+        self._settle(state)
         out = self._pose(state)
         if channel == "smooth":
             out[k.P_RESET_ID], out[k.P_STEP : k.P_STEP + 6] = self._smoother.resets, self._smoother.step
@@ -611,6 +621,9 @@ class ReferenceTimeline:
                     self._move(state, f, 0.5 * (state.u + ahead), t, dt)
                 state.u = ahead
                 state.t = t
+            due = reading is not None or fix is not None
+            if due or state.main.lag > k.LONGEST_LAG or math.floor(t * k.GRID_HZ) != state.grid_at:
+                self._settle(state)
             if reading is not None:
                 for f in state.filters if state.initialised else []:
                     self._odometry(state, f, reading)
@@ -631,21 +644,26 @@ class ReferenceTimeline:
     def _move(self, state: _State, f: ErrorStateFilter, u: Array, t: float, dt: float) -> None:
         """Carry a filter on to t, by the IMU's u (6,), or by itself while there is none."""
         p = self._params
-        walks = (p.gyro_bias_walk, p.accel_bias_walk)
         if state.bridging:
             # straight on, unless the wheels say how it turns
             turns = t - state.t_wheel <= p.imu_gap
             rate = [0.0, 0.0, state.wheel_rate if turns else 0.0]
             rate_noise = p.wheel_rate_sigma / math.sqrt(k.GRID_HZ) if turns else p.no_imu_rate_noise
             force = GRAVITY * f.rotation.T @ f.up
-            f.move(f.bias + np.concatenate([rate, force]), dt, (rate_noise, 0.0, *walks))
+            f.move(f.bias + np.concatenate([rate, force]), dt, rate_noise, 0.0)
+            f.spread(p.gyro_bias_walk, p.accel_bias_walk)
             f.slow(dt, p.no_imu_accel_noise)
             return
         shaken = math.sqrt(state.change[1] / 6.0 * min(state.next_t - state.t_imu, p.imu_gap))
         white = (p.gyro_noise * state.scale[1], max(p.accel_noise * state.scale[0], shaken - 2.0 * p.accel_noise))
         if state.blind:
             white = (state.largest[0] * k.BLIND_TIME, state.largest[1] * k.BLIND_TIME)
-        f.move(u, dt, (*white, *walks))
+        f.move(u, dt, *white)
+
+    def _settle(self, state: _State) -> None:
+        """Bring the covariances up to t, for whatever reads or changes them."""
+        for f in state.filters:
+            f.spread(self._params.gyro_bias_walk, self._params.accel_bias_walk)
 
     # --- measurements
 
