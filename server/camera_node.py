@@ -17,6 +17,7 @@ import ssl
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from urllib.parse import urlsplit
 
 import msgspec
@@ -375,23 +376,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command. Raises NodeError, and OSError for nothing: what is lost is tried again."""
     log_to_stderr()
-
-    def open_here(welcome: CameraWelcome) -> FrameSource:
-        return open_source(
-            args.source,
-            width_px=welcome.width_px,
-            height_px=welcome.height_px,
-            frame_rate_hz=welcome.frame_rate_hz,
-            pixel_format=welcome.pixel_format,
-            exposure=1e-3 * welcome.exposure_ms,
-            gain=welcome.gain,
-            line_time=welcome.line_time,
-        )
-
-    asyncio.run(_run(args, open_here))
+    asyncio.run(_run(args))
     return 0
 
 
-async def _run(args: argparse.Namespace, open: Open) -> None:
-    node = Node(args.server, args.name, open, args.token, args.certificate)
+async def _run(args: argparse.Namespace) -> None:
+    node = Node(args.server, args.name, partial(open_source, args.source), args.token, args.certificate)
     await until_stopped(node.run())

@@ -80,16 +80,7 @@ Open = Callable[[CameraConfig], Source]
 
 def open_configured(config: CameraConfig) -> FrameSource:
     """The source that the configuration names."""
-    return open_source(
-        config.source,
-        width_px=config.width_px,
-        height_px=config.height_px,
-        frame_rate_hz=config.frame_rate_hz,
-        pixel_format=config.pixel_format,
-        exposure=1e-3 * config.exposure_ms,
-        gain=config.gain,
-        line_time=config.line_time,
-    )
+    return open_source(config.source, config)
 
 
 class Camera:

@@ -24,6 +24,7 @@ from playwright.async_api import Page, async_playwright
 from camera.boards import parse_board
 from camera.calibration import load_intrinsics
 from camera.capture import Frame
+from camera.settings import CaptureSettings
 from server import calibrate, cli
 from server.calibration_page import CalibrationPage
 from tests.camera.board_views import CAMERA, Studio, good_poses
@@ -207,8 +208,8 @@ class Wobbly:
         self._pictures = pictures
         self._read = 0
 
-    def open(self, source: str, **wishes: int) -> Wobbly:
-        assert wishes == {"width_px": 640, "height_px": 0}
+    def open(self, source: str, settings: CaptureSettings) -> Wobbly:
+        assert settings == CaptureSettings(width_px=640)
         self.opened += 1
         if self.opened == 2:
             raise FileNotFoundError("camera 0: not there")
