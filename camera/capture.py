@@ -26,7 +26,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
 import numpy as np
 
-from camera.markers import Pixels
+from camera.images import Pixels
 from camera.settings import CAMERAS_OWN, CaptureSettings
 from camera.stamp import StreamClock, host_clocks, host_time
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.capture import Frame
-from camera.markers import Image
+from camera.images import Image
 from camera.settings import CAMERAS_OWN, CaptureSettings
 from camera.stamp import host_clocks, host_time
 

@@ -19,7 +19,7 @@ from camera.boards import DEFAULT_BOARD, Board, BoardDetector, BoardView, parse_
 from camera.calibration import Calibration, CalibrationError, Criterion, calibrate, coverage, judge, save_intrinsics
 from camera.capture import IMAGE_SUFFIXES, FrameSource, open_source, read_image
 from camera.guide import Guide, Step
-from camera.markers import Pixels, grey
+from camera.images import Pixels, grey
 from camera.settings import CaptureSettings
 from server.calibration_page import CalibrationPage
 from server.listening import is_local, own_address, port_number, reachable

@@ -21,7 +21,7 @@ from websockets.asyncio.client import ClientConnection, connect
 
 from camera.calibration import Intrinsics
 from camera.capture import Frame
-from camera.markers import Image
+from camera.images import Image
 from camera.synthetic import Room, straight_down
 from fusion.geometry import exp_so3, inverse, rotation_about_z, transform
 from fusion.measurements import Array, PoseFix, PoseHypothesis

@@ -13,7 +13,7 @@ import pytest
 
 from camera.calibration import save_intrinsics
 from camera.capture import Frame
-from camera.markers import Pixels
+from camera.images import Pixels
 from fusion.geometry import exp_so3, quaternion_from_rotation, rotation_about_z, transform
 from fusion.measurements import Array, Mode, Pose, PoseFix
 from server.cameras import PLACEMENT_FRAMES, Camera, Seen
