@@ -13,6 +13,7 @@ The file is TOML:
 from __future__ import annotations
 
 import datetime
+import hashlib
 import json
 import math
 import os
@@ -52,6 +53,12 @@ class Intrinsics:
     height_px: int = 0
     rms_px: float | None = None
     sigma_px: float = 0.0
+
+    @property
+    def fingerprint(self) -> str:
+        """Of what a pose depends on: the same for the same calibration, another for any other."""
+        numbers = [*self.camera_matrix.ravel().tolist(), *self.distortion.ravel().tolist()]
+        return hashlib.sha256(repr((numbers, self.width_px, self.height_px)).encode()).hexdigest()[:16]
 
     def check_size(self, width_px: int, height_px: int) -> None:
         """Raises CalibrationError if an image of this size is not what was calibrated."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -17,7 +19,8 @@ from camera.synthetic import Room, straight_down
 from fusion.geometry import exp_so3, rotation_about_z, transform
 from server import cli
 from server.cameras import PLACEMENT_FRAMES, Camera
-from server.config import parse
+from server.config import load, parse
+from server.remote_cameras import RemoteCamera
 from tests.server.room import CONFIG, INTRINSICS, Ceiling, run, serving, until
 
 CAMERA = Intrinsics(
@@ -228,6 +231,7 @@ def test_the_service_uses_what_was_written_where_no_anchor_is_in_view(
         placed = camera + 'placement = "ceiling-placement.toml"\n'
         async with serving(parse(CONFIG + placed, folder=tmp_path), open_camera=Ceiling) as service:
             assert service.cameras["ceiling"].unlocated == ""
+            assert service.cameras["ceiling"].advice(0.0) == {}
             await until(
                 lambda: service.robots["rover"].localiser.pose_at(service.cameras["ceiling"].last_frame) is not None
             )
@@ -236,6 +240,33 @@ def test_the_service_uses_what_was_written_where_no_anchor_is_in_view(
             np.testing.assert_allclose(pose.position[:2], Ceiling.WORLD_FROM_BODY[:2, 3], atol=0.03)
 
     run(main)
+
+
+@pytest.mark.parametrize(("source", "kind"), [("frames", Camera), ("remote", RemoteCamera)])
+def test_a_placement_of_another_calibration_is_said_until_it_is_found_again(
+    capfd: pytest.CaptureFixture[str], folder: Path, source: str, kind: type[Camera]
+) -> None:
+    picture = folder / "frames" / "0.png"
+    write(folder, more='placement = "there.toml"\n')
+    config = folder / "room.toml"
+
+    def said() -> dict[str, str]:
+        room = load(config)
+        return kind(msgspec.structs.replace(room.camera[0], source=source), room, lambda seen: None).advice(0.0)
+
+    assert steadfix(capfd, config, picture)[0] == 0
+    assert said() == {}
+    # Only the file of the calibration is written anew: its lens is what it was.
+    save_intrinsics(folder / "camera.toml", replace(CAMERA, rms_px=0.2))
+    assert said() == {}
+    save_intrinsics(
+        folder / "camera.toml", replace(CAMERA, camera_matrix=CAMERA.camera_matrix * [[1.01], [1.0], [1.0]])
+    )
+    (text,) = said().values()
+    assert f"there.toml was found with another calibration than {folder / 'camera.toml'}" in text
+    assert "run `steadfix floor` again" in text
+    assert steadfix(capfd, config, picture)[0] == 0
+    assert said() == {}
 
 
 def test_a_placement_is_kept_while_the_anchors_in_view_agree(tmp_path: Path) -> None:
