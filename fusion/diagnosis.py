@@ -9,9 +9,12 @@ are not told as causes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from fusion.localiser import Localiser
 from fusion.measurements import Array, FixOutcome, PoseHypothesis
@@ -97,3 +100,13 @@ class Seen(NamedTuple):
     fixes: Sequence[JudgedFix]
     lost: Sequence[float]
     learned: Sequence[tuple[float, Array]]
+
+
+def chords(fixes: Sequence[JudgedFix]) -> Array:
+    """(3, n - 1): from each fix to the next of a robot on the floor, how far ahead and aside it went, m, and how far it
+    turned, rad. On an arc the chord has the heading of its middle."""
+    heading = np.unwrap([2.0 * math.atan2(z, w) for w, _, _, z in (fix.pose.quaternion_wxyz for fix in fixes)])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    x, y = np.diff([fix.pose.position[:2] for fix in fixes], axis=0).T
+    c, s = np.cos(middle), np.sin(middle)
+    return np.array([c * x + s * y, c * y - s * x, np.diff(heading)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from fusion.diagnosis import (
     Diagnosis,
     JudgedFix,
     Seen,
+    chords,
 )
 from fusion.geometry import rotation_from_quaternion, rotation_vectors
 from fusion.localiser import Localiser
@@ -160,11 +161,7 @@ def of_rest(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
     # Nor do the blocks around it: within one, a start can hide.
     still = calm & np.append(calm[1:], False) & np.append(False, calm[:-1])
     moving = np.concatenate([[0], np.cumsum(~still)])
-    groups: dict[tuple[str, tuple[int, ...]], list[JudgedFix]] = {}
-    for fix in seen.fixes:
-        if not is_turned(fix):
-            groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
-    for (source, markers), own in groups.items():
+    for (source, markers), own in _by_origin(fix for fix in seen.fixes if not is_turned(fix)).items():
         t = np.array([fix.outcome.t for fix in own]) + seen.localiser.time_offset
         first, last = np.searchsorted(blocks[:, 1], t[:-1]), np.searchsorted(blocks[:, 0], t[1:], side="right")
         rest = (last > first) & (moving[last] == moving[first]) & (last <= len(blocks)) & (t[1:] <= blocks[-1, 1])
@@ -228,21 +225,17 @@ def of_motion(seen: Seen) -> Iterator[Diagnosis]:
 def _of_way(markers: tuple[int, ...], fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
     """Does a robot on two wheels go where its fixes head?
 
-    On an arc the chord has the heading of its middle. A marker that is turned on the robot turns the way by as much,
-    and one that sits in front of the axle goes aside as the robot turns.
+    A marker that is turned on the robot turns the way by as much, and one that sits in front of the axle goes aside as
+    the robot turns.
     """
     t = np.array([fix.outcome.t for fix in fixes])
     close = np.diff(t) <= WAY_STEP
     if np.sum(close) < WAY_PAIRS:
         return
-    position = np.array([fix.pose.position for fix in fixes])
+    ahead, aside, turned = chords(fixes)[:, close]
     variance = np.array([fix.pose.covariance for fix in fixes]).diagonal(axis1=1, axis2=2)
-    heading = np.unwrap([2.0 * math.atan2(z, w) for w, _, _, z in (fix.pose.quaternion_wxyz for fix in fixes)])
-    middle, turned = 0.5 * (heading[1:] + heading[:-1])[close], np.diff(heading)[close]
-    x, y = np.diff(position[:, :2], axis=0)[close].T
-    ahead, aside = np.cos(middle) * x + np.sin(middle) * y, np.cos(middle) * y - np.sin(middle) * x
     both = (variance[1:] + variance[:-1])[close]
-    noise = both[:, :2].mean(axis=1) + 0.25 * (x**2 + y**2) * both[:, 5]
+    noise = both[:, :2].mean(axis=1) + 0.25 * (ahead**2 + aside**2) * both[:, 5]
     ways = np.column_stack([ahead, turned])
     normal = (ways / noise[:, np.newaxis]).T @ ways + 1e-6 * np.eye(2)
     slope, lever = np.linalg.solve(normal, (ways / noise[:, np.newaxis]).T @ aside).tolist()
@@ -282,11 +275,8 @@ def is_turned(fix: JudgedFix) -> bool:
 
 def of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
     """Fixes that are far off in attitude: alike about the vertical, or tipped as the other pose of a flat marker is."""
-    groups: dict[tuple[str, tuple[int, ...]], list[JudgedFix]] = {}
-    for fix in fixes:
-        groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
     turned: list[tuple[str, dict[str, Any]]] = []
-    for (source, markers), own in groups.items():
+    for (source, markers), own in _by_origin(fixes).items():
         turn = np.array([fix.outcome.innovation[3:] for fix in own if is_turned(fix)]).reshape(-1, 3)
         if not len(turn):
             continue
@@ -320,6 +310,14 @@ def of_turns(fixes: Sequence[JudgedFix]) -> Iterator[Diagnosis]:
         else:
             text = f"{name} is mounted or entered turned by {by}: {agree} agree in that"
         yield Diagnosis("fixes_turned", "warning", text, evidence)
+
+
+def _by_origin(fixes: Iterable[JudgedFix]) -> dict[tuple[str, tuple[int, ...]], list[JudgedFix]]:
+    """By camera and markers."""
+    groups: dict[tuple[str, tuple[int, ...]], list[JudgedFix]] = {}
+    for fix in fixes:
+        groups.setdefault((fix.outcome.source, fix.markers), []).append(fix)
+    return groups
 
 
 def _named(markers: tuple[int, ...]) -> str:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fusion.diagnosis import NOISE_LEAST, SIGMAS, WAY_PAIRS, WAY_STEP, Diagnosis, JudgedFix, Seen
+from fusion.diagnosis import NOISE_LEAST, SIGMAS, WAY_PAIRS, WAY_STEP, Diagnosis, JudgedFix, Seen, chords
 from fusion.geometry import rotation_vectors
 from fusion.measurements import Array
 from fusion.params import GRAVITY
@@ -190,10 +190,7 @@ def of_wheels(seen: Seen, blocks: Array) -> Iterator[Diagnosis]:
     speed, rate = (seen.wheels[np.isfinite(seen.wheels[:, i])][:, [0, i]] for i in (1, 2))
     if len(speed) >= WHEEL_READINGS and len(fixes) >= WAY_PAIRS:
         way = np.interp(t, speed[:, 0], _integral(speed))
-        heading = np.unwrap([2.0 * math.atan2(z, w) for w, _, _, z in (fix.pose.quaternion_wxyz for fix in fixes)])
-        middle, turned = 0.5 * (heading[1:] + heading[:-1]), np.diff(heading)
-        x, y = np.diff([fix.pose.position[:2] for fix in fixes], axis=0).T
-        ahead = np.cos(middle) * x + np.sin(middle) * y
+        ahead, _, turned = chords(fixes)
         expected = np.diff(way) * np.sinc(turned / (2.0 * math.pi))  # the chord of an arc
         noise = np.sqrt([2.0 * fix.pose.covariance[0, 0] for fix in fixes[1:]])
         inside = (np.diff(t) <= WAY_STEP) & (t[:-1] >= speed[0, 0]) & (t[1:] <= speed[-1, 0])
