@@ -68,6 +68,17 @@ def rotation_from_quaternion(quaternion_wxyz: ArrayLike) -> Array:
     )
 
 
+def rotation_vectors(a_wxyz: Array, b_wxyz: Array) -> Array:
+    """(n, 3) rad, of length <= pi: the rotations conj(a) b between quaternions, (n, 4) each."""
+    a, b = a_wxyz, b_wxyz
+    w = np.sum(a * b, axis=1)
+    v = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
+    v = np.where(w[:, np.newaxis] < 0.0, -v, v)
+    n = np.linalg.norm(v, axis=1)
+    vectors: Array = v * np.where(n > 1e-9, 2.0 * np.arctan2(n, np.abs(w)) / np.maximum(n, 1e-12), 2.0)[:, np.newaxis]
+    return vectors
+
+
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
     """Rotation (3, 3) -> unit quaternion (4,), w, x, y, z with w >= 0.
 

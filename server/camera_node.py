@@ -17,10 +17,11 @@ import ssl
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from urllib.parse import urlsplit
 
 import msgspec
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from camera.capture import Frame, FrameSource, open_source
@@ -36,15 +37,12 @@ from server.camera_messages import (
     encode,
     to_node,
 )
+from server.connecting import FIRST_PAUSE, connect_to_service, longer
 from server.messages import ClockAnswer, ClockQuestion, Error, MessageError, Notice
 from server.terminal import log_to_stderr, until_stopped
 
 log = logging.getLogger("steadfix.camera")
 
-# s before connecting, or opening the camera, again: the first pause, which doubles up to the longest.
-FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
-# s between asking the service for a sign of life, and until a connection without one is given up.
-PING_INTERVAL, PING_TIMEOUT = 2.0, 3.0
 # s until the service must have answered the hello.
 HELLO_TIMEOUT = 10.0
 # s without a frame after which the camera counts as lost.
@@ -112,7 +110,7 @@ class Watch:
                 log.debug("camera", exc_info=True)
             else:
                 return
-            pause = min(2.0 * pause, LONGEST_PAUSE) if self.trouble else FIRST_PAUSE
+            pause = longer(pause) if self.trouble else FIRST_PAUSE
             if trouble != self.trouble:
                 log.warning("%s; trying again until it works", trouble)
             self.trouble = trouble
@@ -196,15 +194,7 @@ class Node:
         while not self._ended.is_set():
             welcomed = False
             try:
-                async with connect(
-                    self._url,
-                    compression=None,
-                    max_size=1 << 16,
-                    ping_interval=PING_INTERVAL,
-                    ping_timeout=PING_TIMEOUT,
-                    proxy=None,
-                    ssl=self._tls,
-                ) as connection:
+                async with connect_to_service(self._url, self._tls) as connection:
                     await self._begin(connection)
                     welcomed = True
                     log.info("connected to %s as camera %s", self._url, self._name)
@@ -229,7 +219,7 @@ class Node:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._ended.wait()
-            pause = min(2.0 * pause, LONGEST_PAUSE)
+            pause = longer(pause)
 
     async def _begin(self, connection: ClientConnection) -> None:
         """Hello and welcome; the camera is opened if it is not, or with other settings than now wanted."""
@@ -375,23 +365,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command. Raises NodeError, and OSError for nothing: what is lost is tried again."""
     log_to_stderr()
-
-    def open_here(welcome: CameraWelcome) -> FrameSource:
-        return open_source(
-            args.source,
-            width_px=welcome.width_px,
-            height_px=welcome.height_px,
-            frame_rate_hz=welcome.frame_rate_hz,
-            pixel_format=welcome.pixel_format,
-            exposure=1e-3 * welcome.exposure_ms,
-            gain=welcome.gain,
-            line_time=welcome.line_time,
-        )
-
-    asyncio.run(_run(args, open_here))
+    asyncio.run(_run(args))
     return 0
 
 
-async def _run(args: argparse.Namespace, open: Open) -> None:
-    node = Node(args.server, args.name, open, args.token, args.certificate)
+async def _run(args: argparse.Namespace) -> None:
+    node = Node(args.server, args.name, partial(open_source, args.source), args.token, args.certificate)
     await until_stopped(node.run())

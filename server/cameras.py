@@ -80,16 +80,7 @@ Open = Callable[[CameraConfig], Source]
 
 def open_configured(config: CameraConfig) -> FrameSource:
     """The source that the configuration names."""
-    return open_source(
-        config.source,
-        width_px=config.width_px,
-        height_px=config.height_px,
-        frame_rate_hz=config.frame_rate_hz,
-        pixel_format=config.pixel_format,
-        exposure=1e-3 * config.exposure_ms,
-        gain=config.gain,
-        line_time=config.line_time,
-    )
+    return open_source(config.source, config)
 
 
 class Camera:
@@ -288,6 +279,14 @@ class Camera:
             for text in self._repetitions().values():
                 log.warning("camera %s: %s", self.config.name, text)
 
+    def _misplaced(self) -> dict[str, str]:
+        """That its placement file is for another calibration."""
+        placement = self.placement
+        if placement is None or placement.calibration in ("", self.intrinsics.fingerprint):
+            return {}
+        text = f"{self.config.placement} was found with another calibration than {self.config.calibration}, and is "
+        return {"placement": text + "wrong by what they differ: run `steadfix floor` again"}
+
     def _repetitions(self) -> dict[str, str]:
         return {
             f"marker {id}": f"marker {id} is in view more than once; which one is meant cannot be told, so none is used"
@@ -402,11 +401,12 @@ class Camera:
         return self._meter.delivery(now)
 
     def advice(self, now: float) -> dict[str, str]:
-        """What would make its picture better, in words, by what it is about."""
+        """What would make its picture or its fixes better, in words, by what it is about."""
+        texts = self._misplaced() | self._repetitions()
         delivery = self.delivery(now)
         if delivery is None:
-            return self._repetitions()
-        return self._repetitions() | advice(
+            return texts
+        return texts | advice(
             delivery,
             self._edges,
             focal_px=self._focal_px,

@@ -21,7 +21,8 @@ from camera.calibration import Intrinsics, load_intrinsics
 from camera.capture import read_image
 from camera.fix import project, rays
 from camera.floor import Placement, Survey, Tape, averaged, floor_sigma, save_placement, survey
-from camera.markers import MarkerDetector, MarkerSighting, Pixels
+from camera.images import Pixels
+from camera.markers import MarkerDetector, MarkerSighting
 from fusion.geometry import inverse, quaternion_from_rotation, transform_points, yaw_of
 from fusion.measurements import Array
 from server.cameras import READ_TIMEOUT, configured_anchor, open_configured

@@ -305,7 +305,7 @@ class Moving:
         self.due.release()
 
 
-WELCOME = CameraWelcome("ceiling", "test", "4X4_50", [7], [], 0, 0, 0.0, "", 0.0, 0.0, 0.0)
+WELCOME = CameraWelcome("ceiling", "test", "4X4_50", [7], [])
 
 
 @contextlib.asynccontextmanager
