@@ -1065,9 +1065,27 @@ def _watch(s, prm, imu, meta, k):
 
 
 @_jit
-def _loosened(variance, nis, y):
-    """The variance of a constraint that was violated by nis on the mean of late, and is by y now."""
-    return max(variance * max(nis, LEAST_CONSTRAINT), y * y)
+def _projected(f, h):
+    """h P hᵀ of a row h (N,) of H."""
+    total = 0.0
+    for i in range(N):
+        if h[i] != 0.0:
+            for j in range(N):
+                total += h[i] * f[COV + N * i + j] * h[j]
+    return total
+
+
+@_jit
+def _loosened(s, o, i, variance, least, y, h, learn):
+    """The variance of constraint number i, of row h (N,) of H and meant with `variance`, that is violated by y now.
+
+    It is no less than what it has been violated by of late, relative to what it was meant to be, at `least`.
+    """
+    loose = max(s[CONSTRAINT_NIS + i], least)
+    if learn:
+        expected = variance * loose + _projected(s[o : o + BLOCK], h)
+        s[CONSTRAINT_NIS + i] += 0.05 * (min(y * y / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
+    return max(variance * loose, y * y)
 
 
 @_jit
@@ -1086,7 +1104,8 @@ def _constrain(s, prm):
     still_sigma = STILL_SPEED_SIGMA if s[STILL_SURE] > 0.0 else 3.0 * STILL_SPEED_SIGMA
     wheels = prm[MOTION] == DIFFERENTIAL
     for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-        m, sideways = 0, 0
+        m = 0
+        learn = o == MAIN and not still
         if prm[TIME_OFFSET_SIGMA] > 0.0:
             s[o + COV + (N + 1) * DTD] += TIME_OFFSET_WALK * TIME_OFFSET_WALK / GRID_HZ
         H, y, variances = np.zeros((12, N)), np.zeros(12), np.empty(12)
@@ -1096,22 +1115,21 @@ def _constrain(s, prm):
         for i in range(3):
             body[i] = B[0, i] * s[o + V] + B[1, i] * s[o + V + 1] + B[2, i] * s[o + V + 2]
         for i in range(3):
+            sideways = wheels and i == 1 and not still
+            # one in each 2 x SPEED_TIME is independent of the one before
+            variance = max(s[USUAL_SPEED2], LEAST_SPEED * LEAST_SPEED) * 2.0 * SPEED_TIME * GRID_HZ
             if still:
                 variance = still_sigma * still_sigma
-            elif wheels and i == 1:
-                variance = _loosened(prm[WHEEL_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS + 3], body[1])
-                sideways = m
-            else:
-                # one in each 2 x SPEED_TIME is independent of the one before
-                variance = max(s[USUAL_SPEED2], LEAST_SPEED * LEAST_SPEED) * 2.0 * SPEED_TIME * GRID_HZ
+            elif not sideways and s[o + COV + (N + 1) * (DV + i)] < 1e-3 * variance:
                 # a speed that is known a thousand times better learns nothing from this
-                if s[o + COV + (N + 1) * (DV + i)] < 1e-3 * variance:
-                    continue
+                continue
             y[m] = -body[i]
-            variances[m] = variance
             H[m, DV + i] = 1.0
             H[m, (i + 1) % 3] = -body[(i + 2) % 3]
             H[m, (i + 2) % 3] = body[(i + 1) % 3]
+            if sideways:
+                variance = _loosened(s, o, i + 2, prm[WHEEL_VELOCITY_SIGMA] ** 2, LEAST_CONSTRAINT, y[m], H[m], learn)
+            variances[m] = variance
             m += 1
         if s[T] - s[T_ACCEPTED] > COAST_TIME and s[PLACE_COUNT] > 10.0:
             for i in range(3):
@@ -1132,27 +1150,17 @@ def _constrain(s, prm):
             y[m] = -s[o + V + 2]
             for i in range(3):
                 H[m, DV + i] = B[2, i]
-            variances[m] = _loosened(prm[GROUND_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS], y[m])
-            m += 1
             # up in body axes, u = Rᵀe_z, is (0, 0, 1): δu = [u]x δθ
-            y[m], y[m + 1] = -B[2, 0], -B[2, 1]
-            H[m, 1], H[m, 2] = -B[2, 2], B[2, 1]
-            H[m + 1, 0], H[m + 1, 2] = B[2, 2], -B[2, 0]
-            for i in range(1, 3):
-                # not tightened: who leans, leans always
-                variances[m] = _loosened(prm[GROUND_TILT_SIGMA] ** 2, max(s[CONSTRAINT_NIS + i], 1.0), y[m])
+            y[m + 1], y[m + 2] = -B[2, 0], -B[2, 1]
+            H[m + 1, 1], H[m + 1, 2] = -B[2, 2], B[2, 1]
+            H[m + 2, 0], H[m + 2, 2] = B[2, 2], -B[2, 0]
+            for i in range(3):
+                # the tilt is not tightened: who leans, leans always
+                sigma, least = prm[GROUND_TILT_SIGMA], 1.0
+                if i == 0:
+                    sigma, least = prm[GROUND_VELOCITY_SIGMA], LEAST_CONSTRAINT
+                variances[m] = _loosened(s, o, i, sigma * sigma, least, y[m], H[m], learn)
                 m += 1
-        if o == MAIN and prm[MOTION] != FREE and not still:
-            first = m - 3
-            for i in range(4 if wheels else 3):
-                a = first + i if i < 3 else sideways
-                expected = variances[a]
-                for c in range(DP):  # of attitude and velocity only
-                    for d in range(DP):
-                        expected += H[a, c] * s[COV + N * c + d] * H[a, d]
-                # relative to the constraint as it was meant
-                loose = max(s[CONSTRAINT_NIS + i], 1.0 if i == 1 or i == 2 else LEAST_CONSTRAINT)
-                s[CONSTRAINT_NIS + i] += 0.05 * (min(y[a] * y[a] / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
         if m > 0:
             R = np.zeros((m, m))
             for i in range(m):
@@ -1198,11 +1206,7 @@ def _odometry(s, prm, reading):
             y[m] = reading[1 + i] - scale * value
             variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share
             if o == MAIN:
-                expected = variance
-                for c in range(N):
-                    for d in range(N):
-                        expected += H[m, c] * s[COV + N * c + d] * H[m, d]
-                off = y[m] * y[m] / expected
+                off = y[m] * y[m] / (variance + _projected(s[:BLOCK], H[m]))
                 slips |= i == 1 and off > SLIPS
                 s[WHEEL_NIS + i] += 0.05 / share * (min(off, SLIPS) - s[WHEEL_NIS + i])
             if i == 0:
@@ -1389,13 +1393,10 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
 @_jit
 def _copy(a, b):
     """State a to b; a shadow only if there is one."""
-    for i in range(MAIN, SHADOW):
-        b[i] = a[i]
+    _fill(b[:SHADOW], a)
     if a[SHADOW_COUNT] > 0.0:
-        for i in range(SHADOW, AUX):
-            b[i] = a[i]
-    for i in range(AUX, STATE):
-        b[i] = a[i]
+        _fill(b[SHADOW:AUX], a[SHADOW:])
+    _fill(b[AUX:], a[AUX:])
 
 
 @_inline
@@ -1410,17 +1411,25 @@ def _keep_checkpoint(s, prm, checkpoints, meta):
 
 
 @_jit
-def _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live):
-    """Bring a state up to the inputs in the rings that are stamped until then, and the live one with checkpoints."""
+def _advance(s, prm, imu, fixes, fix_end, wheels, wheel_end, checkpoints, meta, until, live):
+    """Bring a state up to the inputs in the rings that are stamped until then, and the live one with checkpoints.
+
+    One that is not live goes on from there: between two samples as ever; beyond the last with its input as long as that
+    is fresh, then at constant velocity.
+    """
     k = int(s[IMU_CURSOR])
-    imu_end, fix_end, wheel_end = int(meta[IMU_END]), int(meta[FIX_END]), int(meta[WHEEL_END])
+    imu_end = int(meta[IMU_END])
     while True:
         row = k & IMU_MASK
-        if k < imu_end and imu[row, 0] <= until:
-            t, trailing = imu[row, 0], 0.0
+        sample = k < imu_end and (imu[row, 0] <= until or s[T] < until)
+        # What is beyond the last sample waits for the IMU, unless that has been silent for too long.
+        fresh = s[T_IMU] + prm[IMU_GAP]
+        paused = meta[HORIZON] > fresh
+        trailing = 0.0
+        if sample:
+            t = min(imu[row, 0], until)
             _next_sample(s, prm, imu, k)
-        elif live and meta[HORIZON] > s[T_IMU] + prm[IMU_GAP]:
-            # What is beyond the last sample waits for the IMU, unless that has been silent for too long.
+        elif live and paused:
             t, trailing = math.inf, 1.0
             if s[FIX_CURSOR] < fix_end:
                 t = fixes[int(s[FIX_CURSOR]) & FIX_MASK, F_T] + s[TD_APPLIED]
@@ -1430,11 +1439,16 @@ def _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live):
                 break
             s[NEXT_T] = math.inf
             s[BRIDGING] = 1.0
+        elif not live and s[T] < until and s[INITIALISED] + fix_end > 0.0:
+            s[BRIDGING] = 1.0 if paused or s[T] >= fresh else 0.0
+            t = until if s[BRIDGING] > 0.0 else min(until, fresh)
+            s[NEXT_T] = math.inf
+            _fill(s[NEXT_U : NEXT_U + 6], s[U:])
         else:
             break
         _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t)
         s[TRAILING] = trailing
-        if trailing == 0.0:
+        if sample and t == imu[row, 0]:
             if s[INITIALISED] > 0.0:
                 if math.floor(t * GRID_HZ) != s[GRID_AT]:
                     _watch(s, prm, imu, meta, k)
@@ -1765,18 +1779,19 @@ def process(memory, task, channel, t, inputs, outputs):
     s = state
     live = task != POSE_AT
     until = math.inf
-    fix_end, wheel_end = 0, 0
+    ahead = False
     if not live:
         until = t
         number = int(meta[CP_END]) - 1
         while number >= meta[CP_FIRST] and checkpoints[number & CP_MASK, T] > t:
             number -= 1
-        if t >= state[T]:
+        # What is still to come waits for the IMU.
+        ahead = t >= state[T]
+        if ahead:
             s = state.copy()
         elif number >= meta[CP_FIRST]:
             # The rows of its fixes are written again, with the same figures.
             s = checkpoints[number & CP_MASK].copy()
-            fix_end, wheel_end = int(meta[FIX_END]), int(meta[WHEEL_END])
         else:
             return 0
     for i in range(inputs.shape[0] if live else 1):
@@ -1797,7 +1812,8 @@ def process(memory, task, channel, t, inputs, outputs):
         elif live:
             ring = imu if task == FEED_SAMPLES else wheels
             answer += _insert_row(state, prm, ring, checkpoints, meta, inputs[i], task == FEED_SAMPLES)
-        _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live)
+        fix_end, wheel_end = (0, 0) if ahead else (int(meta[FIX_END]), int(meta[WHEEL_END]))
+        _advance(s, prm, imu, fixes, fix_end, wheels, wheel_end, checkpoints, meta, until, live)
         if live and started:
             plain = meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor
             moved = not plain
@@ -1817,22 +1833,6 @@ def process(memory, task, channel, t, inputs, outputs):
                 _move(outputs[i, 1:], outputs[i, 4:], ch, s[T] - ch[E_T])
     if live:
         return answer
-    # On from the last sample: between two samples as ever; beyond them with the last input as long as it is fresh,
-    # then at constant velocity.
-    k = int(s[IMU_CURSOR])
-    between = k < meta[IMU_END] and t < state[T]
-    for leg in range(1 if between else 2):
-        t_leg = t
-        if between:
-            _next_sample(s, prm, imu, k)
-        else:
-            s[NEXT_T] = math.inf
-            _fill(s[NEXT_U : NEXT_U + 6], s[U:])
-            t_leg = t if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
-        if t_leg > s[T] and s[INITIALISED] + fix_end > 0.0:
-            if not between:
-                s[BRIDGING] = leg
-            _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_leg)
     if not s[INITIALISED] > 0.0:
         return 0
     out = outputs[0]

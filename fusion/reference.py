@@ -35,32 +35,6 @@ N = 20
 T = TypeVar("T")
 _I3 = np.eye(3)
 _I = np.eye(N)
-_CROSS = np.stack([skew(axis) for axis in _I3], axis=-1)  # [v]x = _CROSS v
-
-
-def _diagonal(block: Array) -> Array:
-    """A view of it, to be written to."""
-    view: Array = np.einsum("ii->i", block)
-    return view
-
-
-class _Step:
-    """F and Q of `ErrorStateFilter.move`: what is the same in every step stands in them, the rest is written anew.
-
-    That goes through views of blocks and diagonals that are made once: with slices, a sample takes 2 us longer, of 35.
-    """
-
-    def __init__(self) -> None:
-        self.F, self.Q = np.eye(N), np.zeros((N, N))
-        # The rows of F that move, of attitude, velocity and position: first in the axes at the start of the step.
-        rows = np.eye(9, N)
-        self.in_start_axes, self.in_end_axes = rows.reshape(3, 3, N), self.F[:9].reshape(3, 3, N)
-        self.velocity, self.position = rows[DV], rows[DP]
-        self.velocity_by_attitude, self.velocity_by_tilt = rows[DV, TH], rows[DV, DTILT]
-        self.by_biases = _diagonal(rows[:6, 9:15])  # attitude and velocity, by those of gyroscope and accelerometer
-        self.position_by_velocity, self.position_by_itself = _diagonal(rows[DP, DV]), _diagonal(rows[DP, DP])
-        noisy = ((TH, TH), (DV, DV), (DV, DP), (DP, DV), (DP, DP), (DBG, DBG), (DBA, DBA))
-        self.variances = [_diagonal(self.Q[block]) for block in noisy]
 
 
 def _no_innovation(_: Array) -> float:
@@ -94,15 +68,14 @@ def _turned(attitude: Array, turn: Array) -> Array:
 class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     """One filter: filterpy holds the error (always zero between updates) and P, the nominal state stands beside.
 
-    No array is ever changed in place, so that a shallow copy is a checkpoint, but for `step`, which copies share: it
-    holds nothing from one step to the next. On matrices this small, `dot` takes a third of the time of `@`.
+    No array is ever changed in place, so that a shallow copy is a checkpoint. On matrices this small, `dot` takes a
+    third of the time of `@`.
     """
 
     def __init__(self) -> None:
         super().__init__(dim_x=N, dim_z=6)
         self.x = np.zeros(N)
         self.P = np.zeros((N, N))
-        self.step = _Step()
         self.face(np.array([1.0, 0.0, 0.0, 0.0]))
         self.velocity = np.zeros(3)
         self.position = np.zeros(3)
@@ -111,6 +84,9 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.wheel_scale = np.zeros(2)  # of wheel odometry: errors of forward speed and yaw rate
         self.lean(np.zeros(2))
         self.corrected = np.zeros(6)  # sum of all moves by updates: position, rotation vector, world axes
+        # P lags behind the nominal state, by so many s since this rotation and velocity. White noise has since been
+        # added to attitude and velocity along each axis, rad2 and (m/s)2.
+        self.lag, self.then, self.white = 0.0, (self.rotation, self.velocity), (0.0, 0.0)
 
     def predict_x(self, u: Any = 0) -> None:
         """The error stays zero; `move` carries the nominal state."""
@@ -132,37 +108,42 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     def gyro_bias(self) -> Array:
         return self.bias[:3]
 
-    def move(self, u: Array, dt: float, noise: tuple[float, float, float, float]) -> None:
-        """Carry over `dt` s of constant rate and specific force u (6,), with its bias.
-
-        `noise`: densities of gyro, accel and their walks.
-        """
+    def move(self, u: Array, dt: float, gyro_noise: float, accel_noise: float) -> None:
+        """Carry the nominal state over `dt` s of constant rate and specific force u (6,), with its bias, measured with
+        such densities of noise. What that does to P waits for `spread`."""
+        if self.lag == 0.0:
+            self.then = self.rotation, self.velocity
+        self.lag += dt
+        self.white = self.white[0] + gyro_noise**2 * dt, self.white[1] + accel_noise**2 * dt
         du = (u - self.bias) * dt
-        turn = du[:3]
-        half_turned = exp_so3(0.5 * turn)
-        turned = half_turned.dot(half_turned)
-        added = half_turned.dot(du[3:])  # Δv, in start axes
-        start, velocity = self.rotation, self.velocity
-        self.face(_turned(self.attitude, turn))
-        self.velocity = velocity + start.dot(added) - GRAVITY * dt * self.up
+        added = exp_so3(0.5 * du[:3]).dot(du[3:])  # Δv, in start axes
+        velocity = self.velocity
+        self.velocity = velocity + self.rotation.dot(added) - GRAVITY * dt * self.up
         self.position = self.position + 0.5 * dt * (velocity + self.velocity)
+        self.face(_turned(self.attitude, du[:3]))
 
-        step = self.step  # of the error: in the axes at the start, then turned into those at the end
-        step.by_biases.fill(-dt)
-        step.velocity_by_attitude[:] = _CROSS.dot(-added)
-        step.velocity_by_tilt[:] = -GRAVITY * dt * start.T.dot(self.up_by_tilt)
-        np.multiply(0.5 * dt, step.velocity, out=step.position)  # it goes by the mean of both velocities
-        step.position_by_velocity.fill(dt)
-        step.position_by_itself.fill(1.0)
-        np.matmul(turned.T, step.in_start_axes, out=step.in_end_axes)
-        gyro_noise, accel_noise, gyro_walk, accel_walk = noise
-        angle, force = gyro_noise**2 * dt, accel_noise**2 * dt
-        both, moved = 0.5 * dt * force, dt * dt / 3.0 * force
-        variances = (angle, force, both, both, moved, gyro_walk**2 * dt, accel_walk**2 * dt)
-        for diagonal, variance in zip(step.variances, variances, strict=True):
-            diagonal.fill(variance)
-        self.F, self.Q = step.F, step.Q
+    def spread(self, gyro_walk: float, accel_walk: float) -> None:
+        """Bring P up to the nominal state, the biases walking with such densities; see `kernels.spread`."""
+        dt = self.lag
+        if dt == 0.0:
+            return
+        start, velocity = self.then
+        A = self.rotation.T.dot(start)  # end axes from start axes
+        added = start.T.dot(self.velocity - velocity + GRAVITY * dt * self.up)  # Δv, in start axes
+        F, Q = _I.copy(), np.zeros((N, N))
+        F[TH, TH] = F[DV, DV] = F[DP, DP] = A
+        F[TH, DBG] = F[DV, DBA] = -dt * A
+        F[DV, TH] = A.dot(skew(-added))
+        F[DV, DTILT] = -GRAVITY * dt * self.rotation.T.dot(self.up_by_tilt)
+        F[DP, TH], F[DP, 9:] = 0.5 * dt * F[DV, TH], 0.5 * dt * F[DV, 9:]  # it goes by the mean of both velocities
+        F[DP, DV] = dt * A
+        angle, speed = self.white
+        Q[TH, TH], Q[DV, DV], Q[DP, DP] = angle * _I3, speed * _I3, dt * dt / 3.0 * speed * _I3
+        Q[DV, DP] = Q[DP, DV] = 0.5 * dt * speed * _I3
+        Q[DBG, DBG], Q[DBA, DBA] = gyro_walk**2 * dt * _I3, accel_walk**2 * dt * _I3
+        self.F, self.Q = F, Q
         self.predict()
+        self.lag, self.white = 0.0, (0.0, 0.0)
 
     def slow(self, dt: float, noise: float) -> None:
         """What `move` leaves out where nothing is measured: the speed decays, and white `noise` pushes the robot."""
@@ -457,13 +438,16 @@ class ReferenceTimeline:
                 self._run_to(state, t, fixes, readings)
         elif state.initialised or fixes:
             state.next_t, state.next_u = math.inf, state.u
-            fresh = min(t, state.t_imu + self._params.imu_gap)
-            for bridging, leg in ((False, fresh), (True, t)):
+            fresh = state.t_imu + self._params.imu_gap
+            # A pause that is known to be one is bridged from its start.
+            legs = [(False, min(t, fresh)), (True, t)] if self._horizon <= fresh else [(True, t)]
+            for bridging, leg in legs:
                 if leg > state.t:
                     state.bridging = bridging
                     self._run_to(state, leg, fixes, readings)
         if not state.initialised:
             return None
+        self._settle(state)
         out = self._pose(state)
         if channel == "smooth":
             out[k.P_RESET_ID], out[k.P_STEP : k.P_STEP + 6] = self._smoother.resets, self._smoother.step
@@ -651,6 +635,9 @@ class ReferenceTimeline:
                     self._move(state, f, 0.5 * (state.u + ahead), t, dt)
                 state.u = ahead
                 state.t = t
+            due = reading is not None or fix is not None
+            if due or state.main.lag > k.LONGEST_LAG or math.floor(t * k.GRID_HZ) != state.grid_at:
+                self._settle(state)
             if reading is not None:
                 for f in state.filters if state.initialised else []:
                     self._odometry(state, f, reading)
@@ -671,21 +658,26 @@ class ReferenceTimeline:
     def _move(self, state: _State, f: ErrorStateFilter, u: Array, t: float, dt: float) -> None:
         """Carry a filter on to t, by the IMU's u (6,), or by itself while there is none."""
         p = self._params
-        walks = (p.gyro_bias_walk, p.accel_bias_walk)
         if state.bridging:
             # straight on, unless the wheels say how it turns
             turns = t - state.t_wheel <= p.imu_gap
             rate = [0.0, 0.0, state.wheel_rate if turns else 0.0]
             rate_noise = p.wheel_rate_sigma / math.sqrt(k.GRID_HZ) if turns else p.no_imu_rate_noise
             force = GRAVITY * f.rotation.T @ f.up
-            f.move(f.bias + np.concatenate([rate, force]), dt, (rate_noise, 0.0, *walks))
+            f.move(f.bias + np.concatenate([rate, force]), dt, rate_noise, 0.0)
+            f.spread(p.gyro_bias_walk, p.accel_bias_walk)
             f.slow(dt, p.no_imu_accel_noise)
             return
         shaken = math.sqrt(state.change_accel / 6.0 * min(state.next_t - state.t_imu, p.imu_gap))
         white = (p.gyro_noise * state.scale[1], max(p.accel_noise * state.scale[0], shaken - 2.0 * p.accel_noise))
         if state.blind:
             white = (state.largest_gyro * k.BLIND_TIME, state.largest_accel * k.BLIND_TIME)
-        f.move(u, dt, (*white, *walks))
+        f.move(u, dt, *white)
+
+    def _settle(self, state: _State) -> None:
+        """Bring the covariances up to t, for whatever reads or changes them."""
+        for f in state.filters:
+            f.spread(self._params.gyro_bias_walk, self._params.accel_bias_walk)
 
     # --- measurements
 
@@ -1013,8 +1005,9 @@ class ReferenceTimeline:
         m = len(y)
         if f is state.main and ground and not still:
             state.constraint_nis = state.constraint_nis.copy()
+            meant = [sigma**2 for sigma in (*sigmas, p.wheel_velocity_sigma)]
             for i, row in enumerate([m - 3, m - 2, m - 1, axes.index(1)] if wheels else [m - 3, m - 2, m - 1]):
-                expected = variances[row] + H[row] @ f.P @ H[row]
+                expected = meant[i] * loose[i] + H[row] @ f.P @ H[row]
                 now = min(y[row] ** 2 / expected, 9.0) * loose[i]
                 state.constraint_nis[i] += 0.05 * (now - state.constraint_nis[i])
         if m:
