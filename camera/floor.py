@@ -128,12 +128,12 @@ def locate_camera(sightings: Sequence[MarkerSighting], anchors: Sequence[Anchor]
     if not seen:
         others = sorted({sighting.id for sighting in sightings})
         raise PlacementError(
-            f"no anchor is in view: {_listed(sorted(by_id))} expected, "
-            f"{_listed(others, 'marker') if others else 'no marker'} seen"
+            f"no anchor is in view: {listed(sorted(by_id))} expected, "
+            f"{listed(others, 'marker') if others else 'no marker'} seen"
         )
     found = _fit(seen, intrinsics)
     if found is None:
-        raise PlacementError(f"no place of the camera explains what it sees of {_listed(ids)}: check size_mm and id")
+        raise PlacementError(f"no place of the camera explains what it sees of {listed(ids)}: check size_mm and id")
     _check_consistent(seen, ids, intrinsics, found[0])
     world_from_camera, covariance, misfit = found
     corners = 4 * len(seen)
@@ -188,7 +188,7 @@ def _check_consistent(
         if shift > CONTRADICTION:
             others = [other for other in ids if other != id]
             raise PlacementError(
-                f"anchor {id} is {shift:.2f} m away from where {_listed(others)} put it, which agree with each "
+                f"anchor {id} is {shift:.2f} m away from where {listed(others)} put it, which agree with each "
                 "other: check its id, size_mm, position_m and yaw_deg"
             )
         return
@@ -221,7 +221,8 @@ def _worst_shift(
     return worst
 
 
-def _listed(ids: Sequence[int], noun: str = "anchor") -> str:
+def listed(ids: Sequence[int], noun: str = "anchor") -> str:
+    """In words: "anchors 40, 41"."""
     return f"{noun}{'s' * (len(ids) != 1)} {', '.join(map(str, ids))}"
 
 
@@ -310,8 +311,8 @@ def survey(
         if all(sighting.camera != camera for _, sighting in seen):
             others = sorted({sighting.id for sighting in sightings if sighting.camera == camera})
             raise PlacementError(
-                f"camera {camera}: no anchor is in view: {_listed(sorted(by_id))} expected, "
-                f"{_listed(others, 'marker') if others else 'no marker'} seen"
+                f"camera {camera}: no anchor is in view: {listed(sorted(by_id))} expected, "
+                f"{listed(others, 'marker') if others else 'no marker'} seen"
             )
     for tape in tapes:
         for id in (tape.first, tape.second):
@@ -371,7 +372,7 @@ def _layout(
                 if best is None or cost < best[0]:
                     best = cost, {camera: world_from_camera}, places
     if best is None:
-        raise PlacementError(f"no place of the camera explains what it sees of {_listed([a.id for a in anchors])}")
+        raise PlacementError(f"no place of the camera explains what it sees of {listed([a.id for a in anchors])}")
     _, cameras, places = best
     while missing := [camera for camera in by_camera if camera not in cameras]:
         found = None
@@ -588,7 +589,7 @@ class _Problem:
                     slice(at.start, at.start + 2),
                     1.0,
                     lambda off, id=anchor.id, others=others: (  # type: ignore[misc]
-                        f"anchor {id} is {1e3 * np.linalg.norm(off):.0f} mm from where {_listed(others)} put"
+                        f"anchor {id} is {1e3 * np.linalg.norm(off):.0f} mm from where {listed(others)} put"
                         f"{'s' * (len(others) == 1)} it: measure its position again"
                     ),
                 )

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +18,7 @@ from camera.calibration import CalibrationError, Intrinsics, load_intrinsics
 from camera.capture import Frame, FrameSource, open_source
 from camera.exposure import Delivery, DeliveryMeter, EdgeBlur, advice, black, blur_px
 from camera.fix import Body, MarkerMount, marker_corners, marker_poses, predict, project, rays, solve
-from camera.floor import Anchor, Placement, PlacementError, averaged, load_placement, locate_camera
+from camera.floor import Anchor, Placement, PlacementError, averaged, listed, load_placement, locate_camera
 from camera.markers import MarkerSighting
 from camera.shake import measure_shake, shaken
 from camera.tracking import MarkerTracker, Prediction
@@ -333,7 +333,7 @@ class Camera:
         """Find the camera from its anchors: at once, better with each of the first frames; then keep it and check."""
         if not anchors:
             if self.placement is None:
-                self.unlocated = f"no anchor is in view; looking for {_listed(self.anchor_ids)}"
+                self.unlocated = f"no anchor is in view; looking for {listed(sorted(self.anchor_ids), 'marker')}"
             return
         self._looks.append(anchors)
         whole = len(self._looks) >= PLACEMENT_FRAMES
@@ -498,7 +498,3 @@ def _view_on_floor(placement: Placement, intrinsics: Intrinsics, width_px: int, 
     points: Array = camera[:2] - (camera[2] / down)[:, None] * directions[:, :2]
     outline: list[list[float]] = points.round(3).tolist()
     return outline
-
-
-def _listed(ids: Collection[int]) -> str:
-    return ("marker " if len(ids) == 1 else "markers ") + ", ".join(map(str, sorted(ids)))

@@ -76,6 +76,18 @@ async def serving(config: str | Config = CONFIG, **arguments: Any) -> AsyncItera
         yield service
 
 
+@contextlib.asynccontextmanager
+async def beside(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    """Work that goes on meanwhile."""
+    task = asyncio.create_task(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
 def client(service: Service, path: str) -> connect:
     return connect(
         f"ws://127.0.0.1:{service.port}{path}", compression=None, proxy=None, ping_interval=None, max_queue=None
