@@ -27,7 +27,8 @@ import numpy as np
 from camera import planar
 from camera.calibration import Intrinsics
 from camera.fix import Body, MarkerMount, marker_corners, predict, solve
-from camera.markers import Image, MarkerSighting
+from camera.images import Image
+from camera.markers import MarkerSighting
 from camera.synthetic import Room, straight_down
 from camera.tracking import MarkerTracker
 from fusion.consistency import chi2_bounds, nees

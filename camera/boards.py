@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.markers import DictionaryError, Image, Pixels, dictionary_by_name, grey
+from camera.dictionaries import DictionaryError, dictionary_by_name
+from camera.images import Image, Pixels, grey
 from fusion.measurements import Array
 
 # Side of a ChArUco board's markers over that of its squares: what is left lets the corners of the squares be measured.

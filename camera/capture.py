@@ -26,7 +26,8 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
 import numpy as np
 
-from camera.markers import Pixels
+from camera.images import Pixels
+from camera.settings import CAMERAS_OWN, CaptureSettings
 from camera.stamp import StreamClock, host_clocks, host_time
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -178,48 +179,34 @@ class FileSource:
         self._closed.set()
 
 
-def open_source(
-    source: str | int,
-    *,
-    width_px: int = 0,
-    height_px: int = 0,
-    frame_rate_hz: float = 0.0,
-    pixel_format: str = "",
-    exposure: float = 0.0,
-    gain: float = 0.0,
-    line_time: float = 0.0,
-    paced: bool = True,
-) -> FrameSource:
+def open_source(source: str | int, settings: CaptureSettings = CAMERAS_OWN, *, paced: bool = True) -> FrameSource:
     """Opens a camera or file.
 
     `source`: a number or "/dev/videoN" (V4L2), "rtsp://...", "picamera", a video file or a folder of images, which are
-    taken in the order of their names. Size, frame rate, `pixel_format` (four letters, V4L2 only), `exposure` (s) and
-    `gain` (a factor for the Pi's camera, the driver's own number for V4L2) are wishes; 0 and "" leave it to the camera,
-    and the log says where one is not granted. `line_time` (s) is only told to whoever reads the frames. A file runs at
-    its own rate, a folder at FOLDER_RATE_HZ, unless `frame_rate_hz` says otherwise; `paced=False` reads them as fast as
+    taken in the order of their names. The log says which of the `settings` a camera does not grant. A file runs at its
+    own rate, a folder at FOLDER_RATE_HZ, unless `frame_rate_hz` says otherwise; `paced=False` reads them as fast as
     possible. Raises OSError in plain words if it is not there.
     """
     if source == "picamera":
         from camera.picamera import PiCamera  # libcamera only exists on a Raspberry Pi
 
-        return LiveSource("picamera", PiCamera(width_px, height_px, frame_rate_hz, exposure, gain), line_time)
+        return LiveSource("picamera", PiCamera(settings), settings.line_time)
     if isinstance(source, int) or source.isdecimal():
         source = f"/dev/video{source}" if sys.platform.startswith("linux") else int(source)
     if isinstance(source, int) or source.startswith("/dev/"):
-        device = V4l2Device(source, width_px, height_px, frame_rate_hz, pixel_format, exposure, gain)
-        return LiveSource(str(source), device, line_time)
+        return LiveSource(str(source), V4l2Device(source, settings), settings.line_time)
     if "://" in source:
-        return LiveSource(without_password(source), NetworkCamera(source), line_time)
+        return LiveSource(without_password(source), NetworkCamera(source), settings.line_time)
     path = Path(source)
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
         if not files:
             raise FileNotFoundError(f"{path}: no image in this folder ({', '.join(sorted(IMAGE_SUFFIXES))})")
-        return FileSource(_images(files), frame_rate_hz or FOLDER_RATE_HZ, paced)
+        return FileSource(_images(files), settings.frame_rate_hz or FOLDER_RATE_HZ, paced)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such video file, folder of images or camera")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    rate = frame_rate_hz or capture.get(cv2.CAP_PROP_FPS)
+    rate = settings.frame_rate_hz or capture.get(cv2.CAP_PROP_FPS)
     # A file that is no video may still open, as one frame of text, but it has no rate or no size.
     if not capture.isOpened() or not rate > 0.0 or capture.get(cv2.CAP_PROP_FRAME_WIDTH) <= 0.0:
         raise OSError(f"{path}: not a video file that can be read")
@@ -248,19 +235,10 @@ def read_image(path: str | os.PathLike[str]) -> Pixels:
 class V4l2Device:
     """A USB camera, or another with a V4L2 driver; on other systems than Linux what OpenCV finds there.
 
-    `exposure` and `gain` above 0 end the camera's own automatic exposure.
+    An exposure and a gain above 0 end the camera's own automatic exposure.
     """
 
-    def __init__(
-        self,
-        source: str | int,
-        width_px: int = 0,
-        height_px: int = 0,
-        frame_rate_hz: float = 0.0,
-        pixel_format: str = "",
-        exposure: float = 0.0,
-        gain: float = 0.0,
-    ) -> None:
+    def __init__(self, source: str | int, settings: CaptureSettings = CAMERAS_OWN) -> None:
         self._name = str(source)
         self._clock: str | None = None
         if isinstance(source, str):
@@ -273,19 +251,19 @@ class V4l2Device:
         # The pixel format first: which sizes and rates there are depends on it. What came of size and rate is seen in
         # the frames.
         for what, value in (
-            (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*pixel_format) if pixel_format else 0),
-            (cv2.CAP_PROP_FRAME_WIDTH, width_px),
-            (cv2.CAP_PROP_FRAME_HEIGHT, height_px),
-            (cv2.CAP_PROP_FPS, frame_rate_hz),
+            (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.pixel_format) if settings.pixel_format else 0),
+            (cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),
+            (cv2.CAP_PROP_FRAME_HEIGHT, settings.height_px),
+            (cv2.CAP_PROP_FPS, settings.frame_rate_hz),
             # V4L2_EXPOSURE_MANUAL: in the dark the automatic lengthens the exposure until all is blur.
-            (cv2.CAP_PROP_AUTO_EXPOSURE, 1.0 if exposure or gain else 0.0),
+            (cv2.CAP_PROP_AUTO_EXPOSURE, 1.0 if settings.exposure_ms or settings.gain else 0.0),
         ):
             if value:
                 self._capture.set(what, value)
-        granted = self._fix("exposure_ms", cv2.CAP_PROP_EXPOSURE, 1e3 * exposure, unit=_EXPOSURE_UNIT_MS)
+        granted = self._fix("exposure_ms", cv2.CAP_PROP_EXPOSURE, settings.exposure_ms, unit=_EXPOSURE_UNIT_MS)
         # s, nan where the camera chooses it
-        self._exposure = exposure if exposure and granted else math.nan
-        self._fix("gain", cv2.CAP_PROP_GAIN, gain)
+        self._exposure = settings.exposure if settings.exposure_ms and granted else math.nan
+        self._fix("gain", cv2.CAP_PROP_GAIN, settings.gain)
 
     def _fix(self, key: str, what: int, value: float, unit: float = 1.0) -> bool:
         """Fix a control at `value`, where that is not 0; whether the camera has taken it."""

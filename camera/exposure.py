@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera.capture import Frame
-from camera.markers import grey
+from camera.images import grey
 
 # Beyond so much motion blur the small markers begin to be missed. px
 BLUR_LIMIT_PX = 3.0

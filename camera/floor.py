@@ -9,6 +9,7 @@ The file is TOML, written by `steadfix floor`:
     covariance = [[...], ...]               # 6 x 6: position (m) and rotation (rad), along world axes
     anchors = [40, 41, 42, 43]              # that it was found from
     rms_px = 0.12                           # of their corners
+    calibration = "5f1d7a3bd2c6e804"        # that it was found with, by `Intrinsics.fingerprint`; "" if unknown
 """
 
 from __future__ import annotations
@@ -51,13 +52,15 @@ class Anchor:
 class Placement:
     """Where a camera is.
 
-    `covariance`: (6, 6), position and rotation, world axes. `rms_px`: of the anchors' corners.
+    `covariance`: (6, 6), position and rotation, world axes. `rms_px`: of the anchors' corners. `calibration`: the
+    fingerprint of the one that it was found with, and is right with; "" if unknown.
     """
 
     world_from_camera: Array
     covariance: Array
     rms_px: float
     anchors_seen: tuple[int, ...]
+    calibration: str = ""
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -65,6 +68,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     covariance: list[list[float]]
     anchors: list[int]
     rms_px: float
+    calibration: str = ""
 
 
 def load_placement(path: str | os.PathLike[str]) -> Placement:
@@ -91,7 +95,7 @@ def load_placement(path: str | os.PathLike[str]) -> Placement:
         raise PlacementError(
             f"{path}: covariance: a symmetric, positive 6 x 6 matrix is needed, as `steadfix floor` writes it"
         )
-    return Placement(pose, covariance, content.rms_px, tuple(content.anchors))
+    return Placement(pose, covariance, content.rms_px, tuple(content.anchors), content.calibration)
 
 
 def save_placement(path: str | os.PathLike[str], placement: Placement, comment: str = "") -> None:
@@ -100,6 +104,7 @@ def save_placement(path: str | os.PathLike[str], placement: Placement, comment: 
     for key, matrix in (("world_from_camera", placement.world_from_camera), ("covariance", placement.covariance)):
         lines += [f"{key} = [", *(f"    {row}," for row in matrix.tolist()), "]"]
     lines += [f"anchors = {list(placement.anchors_seen)}", f"rms_px = {placement.rms_px!r}"]
+    lines += [f'calibration = "{placement.calibration}"']
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -123,12 +128,12 @@ def locate_camera(sightings: Sequence[MarkerSighting], anchors: Sequence[Anchor]
     if not seen:
         others = sorted({sighting.id for sighting in sightings})
         raise PlacementError(
-            f"no anchor is in view: {_listed(sorted(by_id))} expected, "
-            f"{_listed(others, 'marker') if others else 'no marker'} seen"
+            f"no anchor is in view: {listed(sorted(by_id))} expected, "
+            f"{listed(others, 'marker') if others else 'no marker'} seen"
         )
     found = _fit(seen, intrinsics)
     if found is None:
-        raise PlacementError(f"no place of the camera explains what it sees of {_listed(ids)}: check size_mm and id")
+        raise PlacementError(f"no place of the camera explains what it sees of {listed(ids)}: check size_mm and id")
     _check_consistent(seen, ids, intrinsics, found[0])
     world_from_camera, covariance, misfit = found
     corners = 4 * len(seen)
@@ -136,7 +141,8 @@ def locate_camera(sightings: Sequence[MarkerSighting], anchors: Sequence[Anchor]
     mean_sigma_px = math.sqrt(float(np.mean([sighting.sigma_px**2 for _, sighting in seen])))
     freedom = 2 * corners - 6
     widened = misfit / freedom if misfit > chi_square_limit(freedom) else 1.0
-    return Placement(world_from_camera, covariance * widened, rms_sigma * mean_sigma_px, ids)
+    rms_px = rms_sigma * mean_sigma_px
+    return Placement(world_from_camera, covariance * widened, rms_px, ids, intrinsics.fingerprint)
 
 
 def _fit(seen: Sequence[tuple[Anchor, MarkerSighting]], intrinsics: Intrinsics) -> tuple[Array, Array, float] | None:
@@ -182,7 +188,7 @@ def _check_consistent(
         if shift > CONTRADICTION:
             others = [other for other in ids if other != id]
             raise PlacementError(
-                f"anchor {id} is {shift:.2f} m away from where {_listed(others)} put it, which agree with each "
+                f"anchor {id} is {shift:.2f} m away from where {listed(others)} put it, which agree with each "
                 "other: check its id, size_mm, position_m and yaw_deg"
             )
         return
@@ -215,7 +221,8 @@ def _worst_shift(
     return worst
 
 
-def _listed(ids: Sequence[int], noun: str = "anchor") -> str:
+def listed(ids: Sequence[int], noun: str = "anchor") -> str:
+    """In words: "anchors 40, 41"."""
     return f"{noun}{'s' * (len(ids) != 1)} {', '.join(map(str, ids))}"
 
 
@@ -304,8 +311,8 @@ def survey(
         if all(sighting.camera != camera for _, sighting in seen):
             others = sorted({sighting.id for sighting in sightings if sighting.camera == camera})
             raise PlacementError(
-                f"camera {camera}: no anchor is in view: {_listed(sorted(by_id))} expected, "
-                f"{_listed(others, 'marker') if others else 'no marker'} seen"
+                f"camera {camera}: no anchor is in view: {listed(sorted(by_id))} expected, "
+                f"{listed(others, 'marker') if others else 'no marker'} seen"
             )
     for tape in tapes:
         for id in (tape.first, tape.second):
@@ -365,7 +372,7 @@ def _layout(
                 if best is None or cost < best[0]:
                     best = cost, {camera: world_from_camera}, places
     if best is None:
-        raise PlacementError(f"no place of the camera explains what it sees of {_listed([a.id for a in anchors])}")
+        raise PlacementError(f"no place of the camera explains what it sees of {listed([a.id for a in anchors])}")
     _, cameras, places = best
     while missing := [camera for camera in by_camera if camera not in cameras]:
         found = None
@@ -502,6 +509,7 @@ class _Problem:
                 covariance[at, at],
                 math.sqrt(float(np.mean(np.square(off).sum(axis=1)))),
                 tuple(sorted(anchor.id for anchor, _ in seen)),
+                self._intrinsics[camera].fingerprint,
             )
         return Survey(
             placements,
@@ -581,7 +589,7 @@ class _Problem:
                     slice(at.start, at.start + 2),
                     1.0,
                     lambda off, id=anchor.id, others=others: (  # type: ignore[misc]
-                        f"anchor {id} is {1e3 * np.linalg.norm(off):.0f} mm from where {_listed(others)} put"
+                        f"anchor {id} is {1e3 * np.linalg.norm(off):.0f} mm from where {listed(others)} put"
                         f"{'s' * (len(others) == 1)} it: measure its position again"
                     ),
                 )

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -18,21 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.alignment import Alignment
+from camera.dictionaries import dictionary_by_name
 from camera.edges import SIGMA_FLOOR_PX, SIGMA_UNREFINED_PX, refine_corners
+from camera.images import Image, Pixels, grey, sample_image
 from fusion.measurements import Array
-
-Image = NDArray[np.uint8]
-Pixels = NDArray[np.uint8 | np.uint16]
-
-# 4X4_50 ... 7X7_1000, APRILTAG_16H5 ... APRILTAG_36H11, ARUCO_MIP_36H12, ARUCO_ORIGINAL
-DICTIONARIES = tuple(sorted({name.removeprefix("DICT_").upper() for name in dir(cv2.aruco) if name[:5] == "DICT_"}))
 
 # Corners of the unit square in the order of a marker's
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
-
-
-class DictionaryError(ValueError):
-    """There is no such marker dictionary. The text suggests one and lists them all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,43 +41,6 @@ class MarkerSighting:
     corners_px: Array
     sigma_px: float
     blur_px: float = math.nan
-
-
-def dictionary_by_name(name: str) -> cv2.aruco.Dictionary:
-    """A dictionary of OpenCV by its name, in any case, with or without `DICT_`. Raises DictionaryError."""
-    plain = name.strip().upper().removeprefix("DICT_")
-    if plain not in DICTIONARIES:
-        near = difflib.get_close_matches(plain, DICTIONARIES, 1, 0.5)
-        suggestion = f"; did you mean {near[0]}?" if near else "."
-        raise DictionaryError(f"no marker dictionary {name!r}{suggestion} There are: {', '.join(DICTIONARIES)}")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{plain}"))
-
-
-def grey(image: Pixels) -> Image:
-    """Any image with 1, 3 or 4 channels (BGR, BGRA) of 8 or 16 bits -> (height, width) uint8.
-
-    16 bits are stretched: cameras deliver 10 or 12 of them, and only contrast matters. Raises ValueError for others.
-    """
-    pixels: NDArray[np.integer] = np.asarray(image)
-    if pixels.ndim == 3 and pixels.shape[2] == 1:
-        pixels = pixels[..., 0]
-    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)) or pixels.size == 0:
-        raise ValueError(f"an image of shape {pixels.shape}: (height, width) or (height, width, 1, 3 or 4) is needed")
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"an image of {pixels.dtype}: 8 or 16 bit unsigned is needed")
-    if pixels.ndim == 3:
-        pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY if pixels.shape[2] == 3 else cv2.COLOR_BGRA2GRAY))
-    if pixels.dtype == np.uint16:
-        # Not the maximum: one hot pixel would make the picture dark.
-        white = max(float(np.percentile(pixels, 99.9)), 1.0)
-        pixels = np.asarray(cv2.convertScaleAbs(pixels, alpha=255.0 / white))
-    return np.ascontiguousarray(pixels, np.uint8)
-
-
-def sample_image(image: Image, where: NDArray[np.float32], border: int) -> NDArray[np.uint8]:
-    """Values of an image at (rows, columns, 2) px, interpolated linearly. `border`: one of OpenCV's BORDER_ modes."""
-    # The stubs demand a second map, where None is what says that the first one holds both coordinates.
-    return np.asarray(cv2.remap(image, where, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True, slots=True)

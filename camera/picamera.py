@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.capture import Frame
-from camera.markers import Image
+from camera.images import Image
+from camera.settings import CAMERAS_OWN, CaptureSettings
 from camera.stamp import host_clocks, host_time
 
 # s, where none is asked for: at 1 m/s a marker moves 5 mm. Fixed, because the automatic lengthens it in the dark until
@@ -25,19 +26,12 @@ _log = logging.getLogger(__name__)
 
 
 class PiCamera:
-    """A Device of `camera.capture`, with fixed exposure (s) and gain; 0 for what stands above.
+    """A Device of `camera.capture`, with fixed exposure and gain; where none is asked for, what stands above.
 
     Raises OSError if picamera2 or the camera is missing.
     """
 
-    def __init__(
-        self,
-        width_px: int = 0,
-        height_px: int = 0,
-        frame_rate_hz: float = 0.0,
-        exposure: float = 0.0,
-        gain: float = 0.0,
-    ) -> None:
+    def __init__(self, settings: CaptureSettings = CAMERAS_OWN) -> None:
         try:
             from picamera2 import Picamera2
         except ImportError as error:
@@ -47,21 +41,21 @@ class PiCamera:
                 "--system-site-packages. On other machines use a USB camera (source = 0)"
             ) from None
         self._clock: str | None = None
-        self._asked = exposure or EXPOSURE
+        self._asked = settings.exposure or EXPOSURE
         try:
             self._camera: Any = Picamera2()
             controls = {
                 "AeEnable": False,
                 "ExposureTime": round(1e6 * self._asked),
-                "AnalogueGain": gain or GAIN,
+                "AnalogueGain": settings.gain or GAIN,
             }
-            if frame_rate_hz:
-                controls["FrameRate"] = frame_rate_hz
+            if settings.frame_rate_hz:
+                controls["FrameRate"] = settings.frame_rate_hz
             if "LensPosition" in self._camera.camera_controls:
                 # Locked at infinity: a lens that hunts changes the calibration.
                 controls |= {"AfMode": 0, "LensPosition": 0.0}
             configuration = self._camera.create_video_configuration(
-                main={"format": "YUV420", "size": (width_px or SIZE_PX[0], height_px or SIZE_PX[1])},
+                main={"format": "YUV420", "size": (settings.width_px or SIZE_PX[0], settings.height_px or SIZE_PX[1])},
                 buffer_count=4,
                 queue=False,
                 controls=controls,

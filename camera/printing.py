@@ -23,7 +23,7 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from camera.boards import Board
-from camera.markers import dictionary_by_name
+from camera.dictionaries import dictionary_by_name
 from fusion.measurements import Array
 
 # Width and height, mm

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.calibration import Intrinsics
+from camera.dictionaries import dictionary_by_name
 from camera.fix import marker_corners, project
-from camera.markers import dictionary_by_name, sample_image
+from camera.images import sample_image
 from fusion.geometry import inverse, transform, transform_points
 from fusion.measurements import Array
 

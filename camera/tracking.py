@@ -13,19 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera.markers import (
-    ENLARGE_UP_TO,
-    SMALLEST_SIDE_PX,
-    Box,
-    Found,
-    Image,
-    MarkerDetector,
-    MarkerSighting,
-    Pass,
-    Pixels,
-    distinct,
-    grey,
-)
+from camera.images import Image, Pixels, grey
+from camera.markers import ENLARGE_UP_TO, SMALLEST_SIDE_PX, Box, Found, MarkerDetector, MarkerSighting, Pass, distinct
 from fusion.measurements import Array
 
 # A place is good enough for edges alone up to this sigma, px, ...

@@ -68,35 +68,37 @@ def rotation_from_quaternion(quaternion_wxyz: ArrayLike) -> Array:
     )
 
 
+def rotation_vectors(a_wxyz: Array, b_wxyz: Array) -> Array:
+    """(n, 3) rad, of length <= pi: the rotations conj(a) b between quaternions, (n, 4) each."""
+    a, b = a_wxyz, b_wxyz
+    w = np.sum(a * b, axis=1)
+    v = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
+    v = np.where(w[:, np.newaxis] < 0.0, -v, v)
+    n = np.linalg.norm(v, axis=1)
+    vectors: Array = v * np.where(n > 1e-9, 2.0 * np.arctan2(n, np.abs(w)) / np.maximum(n, 1e-12), 2.0)[:, np.newaxis]
+    return vectors
+
+
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
     """Rotation (3, 3) -> unit quaternion (4,), w, x, y, z with w >= 0.
 
     The largest of the four is computed first, so that no small number is divided by (Shepperd's method, 1978).
     """
-    R = np.asarray(rotation, dtype=np.float64)
+    # In scalars: arrays of four take six times as long.
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64).tolist()
     # 4 w², 4 x², 4 y², 4 z² from the diagonal
-    squares = np.array(
-        [
-            1.0 + R[0, 0] + R[1, 1] + R[2, 2],
-            1.0 + R[0, 0] - R[1, 1] - R[2, 2],
-            1.0 - R[0, 0] + R[1, 1] - R[2, 2],
-            1.0 - R[0, 0] - R[1, 1] + R[2, 2],
-        ]
-    )
-    i = int(np.argmax(squares))
-    root = math.sqrt(squares[i])
-    products = np.array(
-        [
-            [squares[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], squares[1], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
-            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], squares[2], R[2, 1] + R[1, 2]],
-            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], squares[3]],
-        ]
-    )
-    q = products[i] / (2.0 * root)
-    q /= np.linalg.norm(q)
-    positive: Array = -q if q[0] < 0.0 else q
-    return positive
+    w2, x2, y2, z2 = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i
+    largest = max(w2, x2, y2, z2)
+    if w2 == largest:
+        w, x, y, z = w2, h - f, c - g, d - b
+    elif x2 == largest:
+        w, x, y, z = h - f, x2, d + b, c + g
+    elif y2 == largest:
+        w, x, y, z = c - g, d + b, y2, h + f
+    else:
+        w, x, y, z = d - b, c + g, h + f, z2
+    scale = math.copysign(1.0 / math.sqrt(w * w + x * x + y * y + z * z), w)
+    return np.array([scale * w, scale * x, scale * y, scale * z])
 
 
 def yaw_of(R: ArrayLike) -> float:

@@ -1,4 +1,4 @@
-"""How well a robot's localisation is: running figures, and what `fusion.diagnosis` says of it.
+"""How well a robot's localisation is: running figures, and what is wrong with it (`fusion.diagnosis`).
 
 `Health` looks on while a `Localiser` is fed and changes nothing. A sample costs it a row in a ring, a fix a look-up
 there; all else is done when it is asked. What it says is about the last two minutes.
@@ -20,21 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from fusion import fix_faults, sensor_faults
 from fusion.consistency import chi2_bounds
-from fusion.diagnosis import (
-    BELIEVED,
-    BLOCK,
-    GAP,
-    LEARNED_STEP,
-    WINDOW,
-    Chunk,
-    Diagnosis,
-    JudgedFix,
-    Score,
-    Seen,
-    diagnose,
-    is_turned,
-)
+from fusion.diagnosis import BLOCK, WINDOW, Chunk, Diagnosis, JudgedFix, Score, Seen
+from fusion.fix_faults import BELIEVED, LEARNED_STEP, is_turned
 from fusion.localiser import Localiser
 from fusion.measurements import Array, FixOutcome, Outcome, Pose, PoseFix, PoseHypothesis, WheelOdometry
 from fusion.params import Channel
@@ -42,26 +31,29 @@ from fusion.params import Channel
 NIS_FIXES = 60  # fixes of the running NIS
 AGES = (0.2, 0.7, 1.7, 4.7)  # s: between the buckets of fix age; not the usual intervals of fixes themselves
 
+# With one of these much else is wrong too, but nothing of it is the cause; what is said besides.
+_ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturates", "accel_saturates"}
+_ROOTS |= {"wheel_unit", "wheel_turn_unit"}
+_BESIDES = {"imu_missing", "imu_stamps_repeat", "no_fix", "fixes_lost", "fixes_late", "fixes_early"}
+
 _KEEP = 4096  # rows that stay when a ring is full: the filter's own ring holds as many
 
 
 class _Poses:
-    """Poses that were given out, and the last fix in each."""
+    """Poses that were given out, and the last fix in each: rows of t, position, quaternion wxyz, instant of the fix."""
 
     def __init__(self) -> None:
         self._rows = np.empty((2 * _KEEP, 9))
         self._instants = self._rows[:, 0]
         self._end = 0
 
-    def add(self, poses: Array, last_fix: float) -> None:
-        """Rows (n, 8) of t, position, quaternion wxyz, n <= _KEEP."""
-        n = len(poses)
+    def next(self, n: int) -> Array:
+        """(n, 9), to be filled with as many more; n <= _KEEP."""
         if self._end + n > len(self._rows):
             self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
             self._end = _KEEP
-        rows = self._rows[self._end : self._end + n]
-        rows[:, :8], rows[:, 8] = poses, last_fix
         self._end += n
+        return self._rows[self._end - n : self._end]
 
     def at(self, t: float, longest: float) -> tuple[Array, float] | None:
         """The pose (7,) for instant t and the last fix in it; None if there was none, in a gap longer than that, s."""
@@ -120,7 +112,8 @@ class Health:
                 self._end = _KEEP
             self._rows[self._end : self._end + n] = samples[at : at + _KEEP]
             self._end += n
-            self._given[0].add(track[at : at + _KEEP], self._last_fix)
+            given = self._given[0].next(n)
+            given[:, :8], given[:, 8] = track[at : at + _KEEP], self._last_fix
         self._last_fix = self.localiser.last_fix
 
     def wheels(self, odometry: WheelOdometry) -> None:
@@ -131,8 +124,8 @@ class Health:
 
     def published(self, pose: Pose) -> None:
         """A pose that was given out, later than the one before."""
-        row = np.concatenate([[pose.t], pose.position, pose.quaternion_wxyz])
-        self._given[1].add(row[np.newaxis], pose.t - pose.fix_age)
+        row = self._given[1].next(1)[0]
+        row[0], row[1:4], row[4:8], row[8] = pose.t, pose.position, pose.quaternion_wxyz, pose.t - pose.fix_age
 
     def another_imu(self) -> None:
         """The device has connected anew, or it is another one: what the last one sent is no measure for it."""
@@ -214,7 +207,7 @@ class Health:
         # The rate may change: a step is long beside those around it.
         usual = np.repeat(np.median(np.resize(steps, (count, BLOCK)), axis=1), BLOCK)[: len(steps)]
         usual = np.where(usual > 0.0, usual, step)
-        long, beside = steps[steps > GAP * usual], usual[steps > GAP * usual]
+        long, beside = steps[steps > sensor_faults.GAP * usual], usual[steps > sensor_faults.GAP * usual]
         # Jittered stamps make long steps too, but short ones make up for those.
         absent = float(np.sum(steps / usual)) - int(np.sum(steps > 0.0))
         missing = max(0.0, min(float(np.sum(np.round(long / beside) - 1.0)), absent))
@@ -293,7 +286,7 @@ class Health:
 
     def diagnoses(self, now: float) -> list[Diagnosis]:
         """What there is to say at `now`, on the clock of the stamps; it is also entered in `said`."""
-        found = diagnose(self._seen(now))
+        found = _diagnose(self._seen(now))
         for diagnosis in found:
             since = self.said[diagnosis.key][0] if diagnosis.key in self.said else now
             self.said[diagnosis.key] = since, now, diagnosis
@@ -309,6 +302,38 @@ class Health:
         wheels = np.concatenate([np.empty((0, 3)), *self._wheels])
         wheels = wheels[np.argsort(wheels[:, 0], kind="stable")]
         return Seen(now, self.localiser, self._began, self._chunks, wheels, stamps, fixes, lost, learned)
+
+
+def _diagnose(seen: Seen) -> list[Diagnosis]:
+    """What there is to say, likely causes before what the filter makes up for."""
+    fixes, planar = seen.fixes, seen.localiser.motion != "free"
+    found: list[Diagnosis] = []
+    if seen.chunks:
+        blocks = np.concatenate([chunk.blocks for chunk in seen.chunks])
+        turns = sensor_faults.turns_between(fixes, blocks)
+        gyro = list(sensor_faults.of_gyro(turns))
+        in_doubt = not gyro and (turns is None or sensor_faults.correlation(turns) < 0.8)
+        found += [*sensor_faults.of_samples(seen, blocks, in_doubt), *sensor_faults.of_gravity(fixes, blocks), *gyro]
+        found += fix_faults.of_rest(seen, blocks)
+    found += fix_faults.of_arrivals(seen)
+    # They are compared with the gyroscope, which must be right for that.
+    wheels = list(sensor_faults.of_wheels(seen, blocks)) if seen.chunks and not gyro else []
+    found += [diagnosis for diagnosis in wheels if diagnosis.code in _ROOTS]
+    codes = {diagnosis.code for diagnosis in found}
+    for causes, besides in (({"imu_stamp_unit"}, set()), ({"fixes_clock"}, set()), (_ROOTS, _BESIDES)):
+        if codes & causes:
+            return [diagnosis for diagnosis in found if diagnosis.code in causes | besides]
+    odd = [*wheels, *fix_faults.of_turns(fixes), *fix_faults.of_motion(seen)]
+    # Where the robot does not move as is assumed, innovations tell nothing else.
+    places, likely = ([], False) if odd else fix_faults.of_places(seen, 2 if planar else 3)
+    if not odd and not places:
+        found += fix_faults.of_learned(seen, codes)
+    if not likely:
+        # Where noise is understated, so are the filter's sigmas, also of what it has come to take for noise.
+        noise = [diagnosis.evidence["times"] for diagnosis in found if diagnosis.code.endswith("_noise")]
+        understated = max([1.0, *noise, *seen.localiser.noise_scale.tolist()])
+        found += fix_faults.of_states(seen.localiser, understated)
+    return [*found, *odd, *places]
 
 
 def _percentile(values: Sequence[float], percent: float, scale: float) -> float | None:

@@ -43,7 +43,11 @@ COV = 21
 N = 20
 TH, DV, DP, DBG, DBA, DTD, DTILT, DWHEEL = 0, 3, 6, 9, 12, 15, 16, 18
 CORRECTED = COV + N * N  # sum of all moves by updates, world axes: position (3), rotation vector (3)
-BLOCK = CORRECTED + 6
+# P lags behind the nominal state by so many seconds, which began at this attitude and velocity; white noise has since
+# been added to attitude and velocity along each axis, rad2 and (m/s)2.
+LAG = CORRECTED + 6
+Q_THEN, V_THEN, ANGLE_VARIANCE, VELOCITY_VARIANCE = LAG + 1, LAG + 5, LAG + 8, LAG + 9
+BLOCK = LAG + 10
 
 # --- The whole state of a robot: the filter, a second one that grows from rejected fixes, and bookkeeping ---------
 MAIN, SHADOW, AUX = 0, BLOCK, 2 * BLOCK
@@ -189,6 +193,7 @@ P_T_ACCEPTED, P_RESET_ID, P_T_IMU = 59, 60, 61
 P_STEP = 62  # of the last reset: position (3), rotation vector (3), world
 POSE = 68
 
+LONGEST_LAG = 0.018  # s: of the covariance behind the state: four samples at 200 Hz
 GRID_HZ = 10.0  # pseudo-measurements come on a fixed grid of time, so that late fixes do not move them
 SPEED_TIME = 2.0  # s: for so long a robot keeps its speed
 LEAST_SPEED = 0.1  # m/s, along an axis: less is not learnt as usual
@@ -301,48 +306,41 @@ def _fill(a, b):
 # ---------------------------------------------------------------------------------------------------------- filter
 
 
-@_fused
-def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_walk, accel_bias_walk):
-    """Carry the filter f (BLOCK,) over `dt` s of constant angular rate and specific force, both raw.
-
-    With Δv, Δp what specific force adds to velocity and position, in the body axes at the *start*, A = Exp(-ω dt) and
-    C = -g dt R̂ᵀ∂u/∂c, u = (c, √(1 - c²)) the vertical, the error goes, up to O(dt²),
-
-        δθ' = A (δθ - dt δbg)
-        δv' = A (δv - Δv × δθ - dt δba + C δc)
-        δp' = A (δp + dt δv - Δp × δθ - dt²/2 δba + dt/2 C δc)
-
-    which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
-    A drops out of Q.
-
-    The filter is an array of its own here: with an offset in the index the loops over P are not vectorised.
-    """
+@_inline
+def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise):
+    """Carry the nominal state of the filter f (BLOCK,) over `dt` s of constant angular rate and specific force, both
+    raw. What that does to P waits for `spread`."""
     wx, wy, wz = gx - f[BG], gy - f[BG + 1], gz - f[BG + 2]
     fx, fy, fz = ax - f[BA], ay - f[BA + 1], az - f[BA + 2]
     qw, qx, qy, qz = f[0], f[1], f[2], f[3]
+    if f[LAG] == 0.0:
+        for i in range(7):
+            f[Q_THEN + i] = f[i]  # attitude and velocity
+    f[LAG] += dt
+    f[ANGLE_VARIANCE] += gyro_noise * gyro_noise * dt
+    f[VELOCITY_VARIANCE] += accel_noise * accel_noise * dt
     # quaternion of half the rotation: cos and sin of a quarter of the angle
-    h = 0.5 * dt
-    quarter = 0.5 * h * math.sqrt(wx * wx + wy * wy + wz * wz)
-    if quarter < 1e-4:
-        hw, h2 = 1.0 - 0.5 * quarter * quarter, 0.5 * h * (1.0 - quarter * quarter / 6.0)
+    quarter2 = dt * dt * (wx * wx + wy * wy + wz * wz) / 16.0
+    if quarter2 < 2e-3:
+        # to the last digit, and several times faster
+        hw = 1.0 - quarter2 / 2.0 * (1.0 - quarter2 / 12.0 * (1.0 - quarter2 / 30.0 * (1.0 - quarter2 / 56.0)))
+        h2 = 0.25 * dt * (1.0 - quarter2 / 6.0 * (1.0 - quarter2 / 20.0 * (1.0 - quarter2 / 42.0)))
     else:
-        hw, h2 = math.cos(quarter), math.sin(quarter) / quarter * 0.5 * h
+        quarter = math.sqrt(quarter2)
+        hw, h2 = math.cos(quarter), math.sin(quarter) / quarter * 0.25 * dt
     hx, hy, hz = h2 * wx, h2 * wy, h2 * wz
     # Δv: the specific force of the midpoint, in start axes
     tx, ty, tz = 2.0 * (hy * fz - hz * fy), 2.0 * (hz * fx - hx * fz), 2.0 * (hx * fy - hy * fx)
     d0 = (fx + hw * tx + hy * tz - hz * ty) * dt
     d1 = (fy + hw * ty + hz * tx - hx * tz) * dt
     d2 = (fz + hw * tz + hx * ty - hy * tx) * dt
-
-    r00, r01, r02 = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
-    r10, r11, r12 = 2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)
-    r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
+    # turned by q, and gravity
+    tx, ty, tz = 2.0 * (qy * d2 - qz * d1), 2.0 * (qz * d0 - qx * d2), 2.0 * (qx * d1 - qy * d0)
     c0, c1 = f[TILT], f[TILT + 1]
     g = -GRAVITY * dt
-    k0 = r00 * d0 + r01 * d1 + r02 * d2 + g * c0
-    k1 = r10 * d0 + r11 * d1 + r12 * d2 + g * c1
-    c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
-    k2 = r20 * d0 + r21 * d1 + r22 * d2 + g * c2
+    k0 = d0 + qw * tx + qy * tz - qz * ty + g * c0
+    k1 = d1 + qw * ty + qz * tx - qx * tz + g * c1
+    k2 = d2 + qw * tz + qx * ty - qy * tx + g * math.sqrt(1.0 - c0 * c0 - c1 * c1)
     f[POS] += (f[V] + 0.5 * k0) * dt
     f[POS + 1] += (f[V + 1] + 0.5 * k1) * dt
     f[POS + 2] += (f[V + 2] + 0.5 * k2) * dt
@@ -358,12 +356,46 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_wa
     scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
     f[0], f[1], f[2], f[3] = nw * scale, nx * scale, ny * scale, nz * scale
 
-    a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
-    a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
-    a02, a12, a22 = 2.0 * (ex * ez - ew * ey), 2.0 * (ey * ez + ew * ex), 1.0 - 2.0 * (ex * ex + ey * ey)
+
+@_fused
+def spread(f, gyro_bias_walk, accel_bias_walk):
+    """Bring P of the filter f (BLOCK,) up to the nominal state: over `LAG` seconds, several samples at once.
+
+    With Δv, Δp what specific force has added to velocity and position, in the body axes at the *start*, A = R̂ᵀR̂_start
+    and C = -g dt R̂_startᵀ∂u/∂c, u = (c, √(1 - c²)) the vertical, the error goes, up to O(dt²),
+
+        δθ' = A (δθ - dt δbg)
+        δv' = A (δv - Δv × δθ - dt δba + C δc)
+        δp' = A (δp + dt δv - Δp × δθ - dt²/2 δba + dt/2 C δc)
+
+    which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
+    A drops out of Q.
+
+    The filter is an array of its own here: with an offset in the index the loops over P are not vectorised.
+    """
+    dt = f[LAG]
+    if dt == 0.0:
+        return
+    h = 0.5 * dt
+    qw, qx, qy, qz = f[Q_THEN], f[Q_THEN + 1], f[Q_THEN + 2], f[Q_THEN + 3]
+    r00, r01, r02 = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
+    r10, r11, r12 = 2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)
+    r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
+    c0, c1 = f[TILT], f[TILT + 1]
+    c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
+    g = -GRAVITY * dt
+    k0, k1, k2 = f[V] - f[V_THEN] - g * c0, f[V + 1] - f[V_THEN + 1] - g * c1, f[V + 2] - f[V_THEN + 2] - g * c2
+    d0, d1, d2 = r00 * k0 + r10 * k1 + r20 * k2, r01 * k0 + r11 * k1 + r21 * k2, r02 * k0 + r12 * k1 + r22 * k2
     t0, t1 = c0 / c2, c1 / c2
     c00, c10, c20 = g * (r00 - t0 * r20), g * (r01 - t0 * r21), g * (r02 - t0 * r22)
     c01, c11, c21 = g * (r10 - t1 * r20), g * (r11 - t1 * r21), g * (r12 - t1 * r22)
+    # the turn since then, q_then⁻¹ q
+    w, x, y, z = f[0], f[1], f[2], f[3]
+    ew, ex = qw * w + qx * x + qy * y + qz * z, qw * x - qx * w - qy * z + qz * y
+    ey, ez = qw * y + qx * z - qy * w - qz * x, qw * z - qx * y + qy * x - qz * w
+    a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
+    a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
+    a02, a12, a22 = 2.0 * (ex * ez - ew * ey), 2.0 * (ey * ez + ew * ex), 1.0 - 2.0 * (ex * ex + ey * ey)
     c = COV
     # F P Fᵀ as F (F P)ᵀ: the same loop twice, over columns that lie side by side in memory. The second round is needed
     # for the first nine columns only, since F leaves the rest alone.
@@ -403,16 +435,15 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise, gyro_bias_wa
                 for j in range(9, N):
                     f[c + N * j + i] = f[c + N * i + j]
 
-    angle_noise = gyro_noise * gyro_noise * dt
-    velocity_noise = accel_noise * accel_noise * dt
     for i in range(3):
-        f[c + (N + 1) * (TH + i)] += angle_noise
-        f[c + (N + 1) * (DV + i)] += velocity_noise
-        f[c + (N + 1) * (DP + i)] += velocity_noise * dt * dt / 3.0
-        f[c + N * (DV + i) + DP + i] += velocity_noise * h
-        f[c + N * (DP + i) + DV + i] += velocity_noise * h
+        f[c + (N + 1) * (TH + i)] += f[ANGLE_VARIANCE]
+        f[c + (N + 1) * (DV + i)] += f[VELOCITY_VARIANCE]
+        f[c + (N + 1) * (DP + i)] += f[VELOCITY_VARIANCE] * dt * dt / 3.0
+        f[c + N * (DV + i) + DP + i] += f[VELOCITY_VARIANCE] * h
+        f[c + N * (DP + i) + DV + i] += f[VELOCITY_VARIANCE] * h
         f[c + (N + 1) * (DBG + i)] += gyro_bias_walk * gyro_bias_walk * dt
         f[c + (N + 1) * (DBA + i)] += accel_bias_walk * accel_bias_walk * dt
+    f[LAG] = f[ANGLE_VARIANCE] = f[VELOCITY_VARIANCE] = 0.0
 
 
 @_jit
@@ -457,6 +488,10 @@ def update(f, H, y, R):
     P - K S Kᵀ with K S Kᵀ = Wᵀ W, W = L⁻¹ H P, S = L Lᵀ: symmetric as it is computed. The state then moves by the
     error dx, and P is expressed in the error about the new state: with R̂⁺ = R̂ Exp(δθ̂), the new error is
     Jr(δθ̂) ε for attitude and Exp(-δθ̂) ε for velocity and position.
+
+    What tells of t_d, a fix, corrects a speed that was wrong at the fixes before as well. It has δp + v δt_d, where the
+    second one finds v to be metres per second off: for p = p̂ + R̂ (δp - δv δt_d) its H is exact, and so are both the
+    move and the new error. Wheels and constraints tell of a speed that may be new: there it stays p = p̂ + R̂ δp.
     """
     m = y.shape[0]
     c = COV
@@ -497,6 +532,12 @@ def update(f, H, y, R):
             for i in range(N):
                 f[c + N * i + j] -= W[a, i] * w
 
+    tells = 0.0
+    for a in range(m):
+        if H[a, DTD] != 0.0:
+            tells = 1.0
+    for i in range(3):
+        dx[DP + i] -= tells * dx[DV + i] * dx[DTD]
     B = np.empty((3, 3))
     _matrix(f, B)
     for i in range(3):
@@ -542,6 +583,9 @@ def update(f, H, y, R):
     # and Pᵀ is kept: without that the rounding of a few minutes grows into a P that is none.
     for second in range(2):
         for j in range(9 if second else N):
+            for i in range(3):
+                product = dx[DV + i] * f[c + N * DTD + j] + dx[DTD] * f[c + N * (DV + i) + j]
+                f[c + N * (DP + i) + j] -= tells * product
             for block in range(3):
                 n = min(block, 1)
                 r = c + 3 * N * block + j
@@ -603,11 +647,10 @@ def _weigh(s, o, prm, fix, H, y, R, S):
 
     Position then attitude, all in body axes, for a fix z at stamp + t_d:
 
-        y_p = R̂ᵀ(z_p - p̂) = δp + R̂ᵀv δt_d,    y_θ = Log(R̂ᵀ R_z) = δθ + ω δt_d
+        y_p = R̂ᵀ(z_p - p̂) = δp + R̂ᵀv̂ δt_d,    y_θ = Log(R̂ᵀ R_z) = δθ + ω δt_d
 
-    R is the fix's covariance turned from world into body axes, the stamp's jitter along the motion, and δv δt_d, what
-    H leaves out: at the second fix neither the speed nor the offset is known. The score of a hypothesis is
-    d² + log|S| + misfit: twice the negative log-likelihood of the pose and of the pixels.
+    R is the fix's covariance turned from world into body axes, and the stamp's jitter along the motion. The score of
+    a hypothesis is d² + log|S| + misfit: twice the negative log-likelihood of the pose and of the pixels.
     -> that of the chosen one.
     """
     B = np.empty((3, 3))
@@ -651,8 +694,6 @@ def _weigh(s, o, prm, fix, H, y, R, S):
                     total += unsure * (B[0, i - 3] * B[0, j - 3] + B[1, i - 3] * B[1, j - 3])
                 if (i < 3) == (j < 3):
                     total *= s[SCALE + 2 + i // 3]
-                if i < 3 and j < 3:
-                    total += s[o + COV + N * (DV + i) + DV + j] * s[o + COV + (N + 1) * DTD]
                 R[i, j] = total
                 # H P Hᵀ: row and column i of P are where H has its 1, DTD where it has its motion
                 a = o + COV + N * ((DP if i < 3 else TH - 3) + i)
@@ -685,7 +726,7 @@ def _weigh(s, o, prm, fix, H, y, R, S):
 def _start(s, o, prm, fix, k, afresh):
     """Pose and covariance of the filter at s[o:] from the hypothesis at fix[k:]; the rest stays, or starts afresh.
 
-    The fix is of stamp + t_d: what is unknown of that has turned the pose, δθ = -ω δt_d beside the fix's own error.
+    The fix is of stamp + t_d: beside its own error the attitude is off by δθ = -ω δt_d.
     """
     f = s[o : o + BLOCK]
     c = COV
@@ -859,8 +900,9 @@ def _judge(s, prm, fix):
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     if s[TWINS] > 0.0:
         # Which of the first fix's poses was it? Both go on until that is clear, the likelier one as the filter.
-        s[LEAD] -= _weigh(s, MAIN, prm, fix, H, y, R, S)
-        s[LEAD] += _weigh(s, SHADOW, prm, fix, H, y, R, S)
+        for o in range(MAIN, AUX, BLOCK):
+            score = _weigh(s, o, prm, fix, H, y, R, S)
+            s[LEAD] += score if o == SHADOW else -score
         if s[LEAD] < 0.0:
             s[LEAD] = -s[LEAD]
             for i in range(BLOCK):
@@ -870,21 +912,20 @@ def _judge(s, prm, fix):
         if s[LEAD] > CLEAR_LEAD:
             s[TWINS] = s[SHADOW_COUNT] = 0.0
         else:
-            # only now is it known which of the two is not the filter, which takes the fix below
+            # the one that is the filter now takes the fix below
             _weigh(s, SHADOW, prm, fix, H, y, R, S)
             if fix[F_D2] <= prm[GATE] * prm[GATE_INFLATION]:
                 update(s[SHADOW:AUX], H, y, R)
     shadows = s[SHADOW_COUNT] > 0.0 and s[TWINS] == 0.0
     agrees, partly = False, False
     figures = np.empty(F_REPORTED - F_D2)
-    if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
-        # After so long without an IMU nothing is left to weigh the fix by.
-        _weigh(s, MAIN, prm, fix, H, y, R, S)
-        _start(s, MAIN, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, False)
-        _restarted(s, prm, fix, 1.0)
-        return
     for o in range(MAIN, SHADOW + 1 if shadows else SHADOW, BLOCK):
         _weigh(s, o, prm, fix, H, y, R, S)
+        if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
+            # After so long without an IMU nothing is left to weigh the fix by.
+            _start(s, MAIN, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, s[INITIALISED] == 0.0)
+            _restarted(s, prm, fix, 1.0)
+            return
         blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
         ratio = max(fix[F_D2] / prm[GATE], blocks)
         if o == MAIN:
@@ -1053,9 +1094,27 @@ def _watch(s, prm, imu, meta, k):
 
 
 @_jit
-def _loosened(variance, nis, y):
-    """The variance of a constraint that was violated by nis on the mean of late, and is by y now."""
-    return max(variance * max(nis, LEAST_CONSTRAINT), y * y)
+def _projected(f, h):
+    """h P hᵀ of a row h (N,) of H."""
+    total = 0.0
+    for i in range(N):
+        if h[i] != 0.0:
+            for j in range(N):
+                total += h[i] * f[COV + N * i + j] * h[j]
+    return total
+
+
+@_jit
+def _loosened(s, o, i, variance, least, y, h, learn):
+    """The variance of constraint number i, of row h (N,) of H and meant with `variance`, that is violated by y now.
+
+    It is no less than what it has been violated by of late, relative to what it was meant to be, at `least`.
+    """
+    loose = max(s[CONSTRAINT_NIS + i], least)
+    if learn:
+        expected = variance * loose + _projected(s[o : o + BLOCK], h)
+        s[CONSTRAINT_NIS + i] += 0.05 * (min(y * y / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
+    return max(variance * loose, y * y)
 
 
 @_jit
@@ -1074,7 +1133,8 @@ def _constrain(s, prm):
     still_sigma = STILL_SPEED_SIGMA if s[STILL_SURE] > 0.0 else 3.0 * STILL_SPEED_SIGMA
     wheels = prm[MOTION] == DIFFERENTIAL
     for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-        m, sideways = 0, 0
+        m = 0
+        learn = o == MAIN and not still
         if prm[TIME_OFFSET_SIGMA] > 0.0:
             s[o + COV + (N + 1) * DTD] += TIME_OFFSET_WALK * TIME_OFFSET_WALK / GRID_HZ
         H, y, variances = np.zeros((12, N)), np.zeros(12), np.empty(12)
@@ -1084,22 +1144,21 @@ def _constrain(s, prm):
         for i in range(3):
             body[i] = B[0, i] * s[o + V] + B[1, i] * s[o + V + 1] + B[2, i] * s[o + V + 2]
         for i in range(3):
+            sideways = wheels and i == 1 and not still
+            # one in each 2 x SPEED_TIME is independent of the one before
+            variance = max(s[USUAL_SPEED2], LEAST_SPEED * LEAST_SPEED) * 2.0 * SPEED_TIME * GRID_HZ
             if still:
                 variance = still_sigma * still_sigma
-            elif wheels and i == 1:
-                variance = _loosened(prm[WHEEL_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS + 3], body[1])
-                sideways = m
-            else:
-                # one in each 2 x SPEED_TIME is independent of the one before
-                variance = max(s[USUAL_SPEED2], LEAST_SPEED * LEAST_SPEED) * 2.0 * SPEED_TIME * GRID_HZ
+            elif not sideways and s[o + COV + (N + 1) * (DV + i)] < 1e-3 * variance:
                 # a speed that is known a thousand times better learns nothing from this
-                if s[o + COV + (N + 1) * (DV + i)] < 1e-3 * variance:
-                    continue
+                continue
             y[m] = -body[i]
-            variances[m] = variance
             H[m, DV + i] = 1.0
             H[m, (i + 1) % 3] = -body[(i + 2) % 3]
             H[m, (i + 2) % 3] = body[(i + 1) % 3]
+            if sideways:
+                variance = _loosened(s, o, i + 2, prm[WHEEL_VELOCITY_SIGMA] ** 2, LEAST_CONSTRAINT, y[m], H[m], learn)
+            variances[m] = variance
             m += 1
         if s[T] - s[T_ACCEPTED] > COAST_TIME and s[PLACE_COUNT] > 10.0:
             for i in range(3):
@@ -1120,27 +1179,17 @@ def _constrain(s, prm):
             y[m] = -s[o + V + 2]
             for i in range(3):
                 H[m, DV + i] = B[2, i]
-            variances[m] = _loosened(prm[GROUND_VELOCITY_SIGMA] ** 2, s[CONSTRAINT_NIS], y[m])
-            m += 1
             # up in body axes, u = Rᵀe_z, is (0, 0, 1): δu = [u]x δθ
-            y[m], y[m + 1] = -B[2, 0], -B[2, 1]
-            H[m, 1], H[m, 2] = -B[2, 2], B[2, 1]
-            H[m + 1, 0], H[m + 1, 2] = B[2, 2], -B[2, 0]
-            for i in range(1, 3):
-                # not tightened: who leans, leans always
-                variances[m] = _loosened(prm[GROUND_TILT_SIGMA] ** 2, max(s[CONSTRAINT_NIS + i], 1.0), y[m])
+            y[m + 1], y[m + 2] = -B[2, 0], -B[2, 1]
+            H[m + 1, 1], H[m + 1, 2] = -B[2, 2], B[2, 1]
+            H[m + 2, 0], H[m + 2, 2] = B[2, 2], -B[2, 0]
+            for i in range(3):
+                # the tilt is not tightened: who leans, leans always
+                sigma, least = prm[GROUND_TILT_SIGMA], 1.0
+                if i == 0:
+                    sigma, least = prm[GROUND_VELOCITY_SIGMA], LEAST_CONSTRAINT
+                variances[m] = _loosened(s, o, i, sigma * sigma, least, y[m], H[m], learn)
                 m += 1
-        if o == MAIN and prm[MOTION] != FREE and not still:
-            first = m - 3
-            for i in range(4 if wheels else 3):
-                a = first + i if i < 3 else sideways
-                expected = variances[a]
-                for c in range(DP):  # of attitude and velocity only
-                    for d in range(DP):
-                        expected += H[a, c] * s[COV + N * c + d] * H[a, d]
-                # relative to the constraint as it was meant
-                loose = max(s[CONSTRAINT_NIS + i], 1.0 if i == 1 or i == 2 else LEAST_CONSTRAINT)
-                s[CONSTRAINT_NIS + i] += 0.05 * (min(y[a] * y[a] / expected, 9.0) * loose - s[CONSTRAINT_NIS + i])
         if m > 0:
             R = np.zeros((m, m))
             for i in range(m):
@@ -1186,11 +1235,7 @@ def _odometry(s, prm, reading):
             y[m] = reading[1 + i] - scale * value
             variance = prm[WHEEL_SPEED_SIGMA + i] ** 2 * share
             if o == MAIN:
-                expected = variance
-                for c in range(N):
-                    for d in range(N):
-                        expected += H[m, c] * s[COV + N * c + d] * H[m, d]
-                off = y[m] * y[m] / expected
+                off = y[m] * y[m] / (variance + _projected(s[:BLOCK], H[m]))
                 slips |= i == 1 and off > SLIPS
                 s[WHEEL_NIS + i] += 0.05 / share * (min(off, SLIPS) - s[WHEEL_NIS + i])
             if i == 0:
@@ -1277,6 +1322,13 @@ def _next_sample(s, prm, imu, k):
 
 
 @_jit
+def _settle(s, prm):
+    """Bring the covariances up to T, for whatever reads or changes them."""
+    for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
+        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
+
+
+@_jit
 def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
     """Carry the state to t_end, on its way to the next sample, and take all that is due until then at its instant."""
     while True:
@@ -1334,11 +1386,9 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                         rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
                         if turns:
                             rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
-                    predict(
-                        s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt,
-                        rate_noise, force_noise, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK],
-                    )  # fmt: skip
+                    predict(s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt, rate_noise, force_noise)
                     if s[BRIDGING] > 0.0:
+                        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
                         _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
             if part == 1.0:
                 for i in range(6):
@@ -1347,6 +1397,8 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                 for i in range(6):
                     s[U + i] += part * (s[NEXT_U + i] - s[U + i])
             s[T] = t
+        if due != NOTHING or s[LAG] > LONGEST_LAG or math.floor(t * GRID_HZ) != s[GRID_AT]:
+            _settle(s, prm)
         if due == NOTHING:
             return
         if due == A_READING:
@@ -1370,13 +1422,10 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
 @_jit
 def _copy(a, b):
     """State a to b; a shadow only if there is one."""
-    for i in range(MAIN, SHADOW):
-        b[i] = a[i]
+    _fill(b[:SHADOW], a)
     if a[SHADOW_COUNT] > 0.0:
-        for i in range(SHADOW, AUX):
-            b[i] = a[i]
-    for i in range(AUX, STATE):
-        b[i] = a[i]
+        _fill(b[SHADOW:AUX], a[SHADOW:])
+    _fill(b[AUX:], a[AUX:])
 
 
 @_inline
@@ -1391,17 +1440,25 @@ def _keep_checkpoint(s, prm, checkpoints, meta):
 
 
 @_jit
-def _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live):
-    """Bring a state up to the inputs in the rings that are stamped until then, and the live one with checkpoints."""
+def _advance(s, prm, imu, fixes, fix_end, wheels, wheel_end, checkpoints, meta, until, live):
+    """Bring a state up to the inputs in the rings that are stamped until then, and the live one with checkpoints.
+
+    One that is not live goes on from there: between two samples as ever; beyond the last with its input as long as that
+    is fresh, then at constant velocity.
+    """
     k = int(s[IMU_CURSOR])
-    imu_end, fix_end, wheel_end = int(meta[IMU_END]), int(meta[FIX_END]), int(meta[WHEEL_END])
+    imu_end = int(meta[IMU_END])
     while True:
         row = k & IMU_MASK
-        if k < imu_end and imu[row, 0] <= until:
-            t, trailing = imu[row, 0], 0.0
+        sample = k < imu_end and (imu[row, 0] <= until or s[T] < until)
+        # What is beyond the last sample waits for the IMU, unless that has been silent for too long.
+        fresh = s[T_IMU] + prm[IMU_GAP]
+        paused = meta[HORIZON] > fresh
+        trailing = 0.0
+        if sample:
+            t = min(imu[row, 0], until)
             _next_sample(s, prm, imu, k)
-        elif live and meta[HORIZON] > s[T_IMU] + prm[IMU_GAP]:
-            # What is beyond the last sample waits for the IMU, unless that has been silent for too long.
+        elif live and paused:
             t, trailing = math.inf, 1.0
             if s[FIX_CURSOR] < fix_end:
                 t = fixes[int(s[FIX_CURSOR]) & FIX_MASK, F_T] + s[TD_APPLIED]
@@ -1411,11 +1468,16 @@ def _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live):
                 break
             s[NEXT_T] = math.inf
             s[BRIDGING] = 1.0
+        elif not live and s[T] < until and s[INITIALISED] + fix_end > 0.0:
+            s[BRIDGING] = 1.0 if paused or s[T] >= fresh else 0.0
+            t = until if s[BRIDGING] > 0.0 else min(until, fresh)
+            s[NEXT_T] = math.inf
+            _fill(s[NEXT_U : NEXT_U + 6], s[U:])
         else:
             break
         _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t)
         s[TRAILING] = trailing
-        if trailing == 0.0:
+        if sample and t == imu[row, 0]:
             if s[INITIALISED] > 0.0:
                 if math.floor(t * GRID_HZ) != s[GRID_AT]:
                     _watch(s, prm, imu, meta, k)
@@ -1487,16 +1549,17 @@ def _plausible(meta, prm, t):
     return False
 
 
-@_jit
-def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
+@_inline
+def _insert_row(s, prm, ring, checkpoints, meta, reading, imu):
     """Put a reading of the IMU, or of the wheels, in its place in the ring, and rewind the state if need be.
 
-    `counters`: where in meta the ring's first and end stand. `imu`: whose ring it is. False: it was dropped.
+    `imu`: whose ring it is. -> how many are kept of it: 1, or 0.
     """
     t = reading[0]
+    counters = IMU_FIRST if imu else WHEEL_FIRST
     if not _plausible(meta, prm, t):
         meta[IMU_LATE if imu else WHEEL_LATE] += 1.0
-        return False
+        return 0
     width, mask = ring.shape[1], ring.shape[0] - 1
     first, end = int(meta[counters]), int(meta[counters + 1])
     place = end
@@ -1512,11 +1575,11 @@ def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
                 replaces = a < b or math.isnan(b)
                 break
         if not replaces:
-            return False
+            return 0
     in_order = _precedes_sample(s, t, prm[IMU_GAP]) if imu else s[T] < t
     if (replaces or place < end or not in_order) and not _rewind(s, prm, checkpoints, meta, t, -1.0 if imu else -2.0):
         meta[IMU_LATE if imu else WHEEL_LATE] += 1.0
-        return False
+        return 0
     if replaces:
         place -= 1
     else:
@@ -1531,7 +1594,7 @@ def _insert_row(s, prm, ring, counters, checkpoints, meta, reading, imu):
     if end - first == mask + 1:
         meta[counters] = first + 1
         _drop_orphans(checkpoints, meta)
-    return True
+    return 1
 
 
 @_jit
@@ -1653,12 +1716,10 @@ def _ahead(dt, age, gap):
 
 @_jit
 def _absorb(s, prm, ch, plain):
-    """Set E such that the smooth pose does not move by what an input has done to the filter's."""
-    moved = False
-    for i in range(6):
-        moved |= s[CORRECTED + i] != ch[BEFORE_CORRECTED + i]
-    if plain and not moved:
-        return
+    """Set E such that the smooth pose does not move by what an input has done to the filter's.
+
+    `plain`: by updates alone, in passing, not by a fix or by having done the past again.
+    """
     # Where both would have been at the latest instant that is known outside.
     at = s[T] if plain else min(max(ch[E_PUBLISHED], s[T]), s[T] + SMOOTH_REACH)
     if at > ch[E_T]:
@@ -1747,18 +1808,19 @@ def process(memory, task, channel, t, inputs, outputs):
     s = state
     live = task != POSE_AT
     until = math.inf
-    fix_end, wheel_end = 0, 0
+    ahead = False
     if not live:
         until = t
         number = int(meta[CP_END]) - 1
         while number >= meta[CP_FIRST] and checkpoints[number & CP_MASK, T] > t:
             number -= 1
-        if t >= state[T]:
+        # What is still to come waits for the IMU.
+        ahead = t >= state[T]
+        if ahead:
             s = state.copy()
         elif number >= meta[CP_FIRST]:
             # The rows of its fixes are written again, with the same figures.
             s = checkpoints[number & CP_MASK].copy()
-            fix_end, wheel_end = int(meta[FIX_END]), int(meta[WHEEL_END])
         else:
             return 0
     for i in range(inputs.shape[0] if live else 1):
@@ -1774,17 +1836,20 @@ def process(memory, task, channel, t, inputs, outputs):
                 ch[BEFORE + 4 + j] = state[Q + j]
             for j in range(6):
                 ch[BEFORE_CORRECTED + j] = state[CORRECTED + j]
-        if task == FEED_SAMPLES:
-            if _insert_row(state, prm, imu, IMU_FIRST, checkpoints, meta, inputs[i], True):
-                answer += 1
-        elif task == FEED_WHEELS:
-            if _insert_row(state, prm, wheels, WHEEL_FIRST, checkpoints, meta, inputs[i], False):
-                answer += 1
-        elif task == FEED_FIX:
+        if task == FEED_FIX:
             answer = _insert_fix(state, prm, fixes, checkpoints, meta, inputs[i])
-        _advance(s, prm, imu, fixes, wheels, checkpoints, meta, until, live)
+        elif live:
+            ring = imu if task == FEED_SAMPLES else wheels
+            answer += _insert_row(state, prm, ring, checkpoints, meta, inputs[i], task == FEED_SAMPLES)
+        fix_end, wheel_end = (0, 0) if ahead else (int(meta[FIX_END]), int(meta[WHEEL_END]))
+        _advance(s, prm, imu, fixes, fix_end, wheels, wheel_end, checkpoints, meta, until, live)
         if live and started:
-            _absorb(state, prm, ch, meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor)
+            plain = meta[REWINDS] == rewinds and state[FIX_CURSOR] == cursor
+            moved = not plain
+            for j in range(6):
+                moved |= state[CORRECTED + j] != ch[BEFORE_CORRECTED + j]
+            if moved:
+                _absorb(state, prm, ch, plain)
         elif live:
             ch[E_T] = state[T]
         if task == FEED_SAMPLES and i < outputs.shape[0]:
@@ -1797,25 +1862,10 @@ def process(memory, task, channel, t, inputs, outputs):
                 _move(outputs[i, 1:], outputs[i, 4:], ch, s[T] - ch[E_T])
     if live:
         return answer
-    # On from the last sample: between two samples as ever; beyond them with the last input as long as it is fresh,
-    # then at constant velocity.
-    k = int(s[IMU_CURSOR])
-    between = k < meta[IMU_END] and t < state[T]
-    for leg in range(1 if between else 2):
-        t_leg = t
-        if between:
-            _next_sample(s, prm, imu, k)
-        else:
-            s[NEXT_T] = math.inf
-            _fill(s[NEXT_U : NEXT_U + 6], s[U:])
-            t_leg = t if leg == 1 else min(t, s[T_IMU] + prm[IMU_GAP])
-        if t_leg > s[T] and s[INITIALISED] + fix_end > 0.0:
-            if not between:
-                s[BRIDGING] = leg
-            _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_leg)
     if not s[INITIALISED] > 0.0:
         return 0
     out = outputs[0]
+    _settle(s, prm)
     _write_pose(s, out)
     if channel == SMOOTH:
         out[P_RESET_ID] = ch[E_RESETS]

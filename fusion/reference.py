@@ -7,9 +7,9 @@ and the rules of the timeline are described in `fusion.kernels`; the layouts of 
 from __future__ import annotations
 
 import bisect
-import copy
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -32,23 +32,37 @@ TH, DV, DP, DBG, DBA, DTILT, DWHEEL = (
 )
 DTD = 15
 N = 20
+T = TypeVar("T")
 _I3 = np.eye(3)
 _I = np.eye(N)
 
 
-def _noise_patterns() -> Array:
-    """(6, N²): where the variances of a step stand in Q, that of the angle first."""
-    Q = np.zeros((6, N, N))
-    Q[0, TH, TH] = Q[1, DV, DV] = Q[3, DP, DP] = Q[4, DBG, DBG] = Q[5, DBA, DBA] = _I3
-    Q[2, DV, DP] = Q[2, DP, DV] = _I3
-    return Q.reshape(6, N * N)
-
-
-_NOISE = _noise_patterns()
-
-
 def _no_innovation(_: Array) -> float:
     return 0.0
+
+
+def _shallow_copy(original: T) -> T:
+    """As `copy.copy`, in a third of the time: there is nothing to an object here but its attributes."""
+    other = object.__new__(type(original))
+    other.__dict__.update(original.__dict__)
+    return other
+
+
+def _turned(attitude: Array, turn: Array) -> Array:
+    """q ⊗ Exp(φ): a quaternion wxyz turned by a rotation vector in its own axes."""
+    a, b, c, d = attitude.tolist()
+    x, y, z = turn.tolist()
+    angle = math.hypot(x, y, z)
+    w, share = math.cos(0.5 * angle), math.sin(0.5 * angle) / angle if angle else 0.5
+    x, y, z = share * x, share * y, share * z
+    return np.array(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ]
+    )
 
 
 class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -62,7 +76,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         super().__init__(dim_x=N, dim_z=6)
         self.x = np.zeros(N)
         self.P = np.zeros((N, N))
-        self.rotation = np.eye(3)
+        self.face(np.array([1.0, 0.0, 0.0, 0.0]))
         self.velocity = np.zeros(3)
         self.position = np.zeros(3)
         self.bias = np.zeros(6)  # of the IMU's sample: gyro, accel
@@ -70,9 +84,17 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.wheel_scale = np.zeros(2)  # of wheel odometry: errors of forward speed and yaw rate
         self.lean(np.zeros(2))
         self.corrected = np.zeros(6)  # sum of all moves by updates: position, rotation vector, world axes
+        # P lags behind the nominal state, by so many s since this rotation and velocity. White noise has since been
+        # added to attitude and velocity along each axis, rad2 and (m/s)2.
+        self.lag, self.then, self.white = 0.0, (self.rotation, self.velocity), (0.0, 0.0)
 
     def predict_x(self, u: Any = 0) -> None:
         """The error stays zero; `move` carries the nominal state."""
+
+    def face(self, attitude: Array) -> None:
+        """Set the attitude (4,), which poses are published with, and the matrix that all else reckons with."""
+        self.attitude = attitude
+        self.rotation = rotation_from_quaternion(attitude)
 
     def lean(self, tilt: Array) -> None:
         """Set the tilt, and with it the vertical in the world frame (3,) and how it goes with the tilt (3, 2)."""
@@ -86,35 +108,42 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     def gyro_bias(self) -> Array:
         return self.bias[:3]
 
-    def move(self, u: Array, dt: float, noise: tuple[float, float, float, float]) -> None:
-        """Carry over `dt` s of constant rate and specific force u (6,), with its bias.
-
-        `noise`: densities of gyro, accel and their walks.
-        """
+    def move(self, u: Array, dt: float, gyro_noise: float, accel_noise: float) -> None:
+        """Carry the nominal state over `dt` s of constant rate and specific force u (6,), with its bias, measured with
+        such densities of noise. What that does to P waits for `spread`."""
+        if self.lag == 0.0:
+            self.then = self.rotation, self.velocity
+        self.lag += dt
+        self.white = self.white[0] + gyro_noise**2 * dt, self.white[1] + accel_noise**2 * dt
         du = (u - self.bias) * dt
-        half_turned = exp_so3(0.5 * du[:3])
-        turned = half_turned.dot(half_turned)
-        added = half_turned.dot(du[3:])  # Δv, in start axes
-        start, velocity = self.rotation, self.velocity
-        self.rotation = start.dot(turned)
-        self.velocity = velocity + start.dot(added) - GRAVITY * dt * self.up
+        added = exp_so3(0.5 * du[:3]).dot(du[3:])  # Δv, in start axes
+        velocity = self.velocity
+        self.velocity = velocity + self.rotation.dot(added) - GRAVITY * dt * self.up
         self.position = self.position + 0.5 * dt * (velocity + self.velocity)
+        self.face(_turned(self.attitude, du[:3]))
 
-        A = turned.T  # end axes from start axes
-        A_dt = dt * A
-        F = _I.copy()
-        F[TH, TH] = F[DV, DV] = A
-        F[TH, DBG] = F[DV, DBA] = -A_dt
+    def spread(self, gyro_walk: float, accel_walk: float) -> None:
+        """Bring P up to the nominal state, the biases walking with such densities; see `kernels.spread`."""
+        dt = self.lag
+        if dt == 0.0:
+            return
+        start, velocity = self.then
+        A = self.rotation.T.dot(start)  # end axes from start axes
+        added = start.T.dot(self.velocity - velocity + GRAVITY * dt * self.up)  # Δv, in start axes
+        F, Q = _I.copy(), np.zeros((N, N))
+        F[TH, TH] = F[DV, DV] = F[DP, DP] = A
+        F[TH, DBG] = F[DV, DBA] = -dt * A
         F[DV, TH] = A.dot(skew(-added))
         F[DV, DTILT] = -GRAVITY * dt * self.rotation.T.dot(self.up_by_tilt)
-        F[DP] = 0.5 * dt * F[DV]  # the position goes by the mean of both velocities
-        F[DP, DV] = A_dt
-        F[DP, DP] = A
-        gyro_noise, accel_noise, gyro_walk, accel_walk = noise
-        angle, force = gyro_noise**2 * dt, accel_noise**2 * dt
-        variances = [angle, force, 0.5 * dt * force, dt * dt / 3.0 * force, gyro_walk**2 * dt, accel_walk**2 * dt]
-        self.F, self.Q = F, np.array(variances).dot(_NOISE).reshape(N, N)
+        F[DP, TH], F[DP, 9:] = 0.5 * dt * F[DV, TH], 0.5 * dt * F[DV, 9:]  # it goes by the mean of both velocities
+        F[DP, DV] = dt * A
+        angle, speed = self.white
+        Q[TH, TH], Q[DV, DV], Q[DP, DP] = angle * _I3, speed * _I3, dt * dt / 3.0 * speed * _I3
+        Q[DV, DP] = Q[DP, DV] = 0.5 * dt * speed * _I3
+        Q[DBG, DBG], Q[DBA, DBA] = gyro_walk**2 * dt * _I3, accel_walk**2 * dt * _I3
+        self.F, self.Q = F, Q
         self.predict()
+        self.lag, self.white = 0.0, (0.0, 0.0)
 
     def slow(self, dt: float, noise: float) -> None:
         """What `move` leaves out where nothing is measured: the speed decays, and white `noise` pushes the robot."""
@@ -138,6 +167,8 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.update(y, lambda _: H, _no_innovation, R=R)
         dx = self.x
         self.x = np.zeros(N)
+        tells = float(H[:, DTD].any())  # of the time offset: a fix
+        dx[DP] -= tells * dx[DTD] * dx[DV]
         turn = dx[TH]
         turned, faster, moved = self.rotation.dot(dx[:9].reshape(3, 3).T).T  # world axes
         self.corrected = self.corrected + np.concatenate([moved, turned])
@@ -152,19 +183,18 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         b, c = (0.5, 1.0 / 6.0)
         if angle > 1e-4:
             b, c = (1.0 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
-        exp = exp_so3(turn)
         J = _I.copy()
         J[TH, TH] = _I3 - b * K + c * K.dot(K)
-        J[DV, DV] = J[DP, DP] = exp.T
+        J[DV, DV] = J[DP, DP] = exp_so3(turn).T
+        J[DP, DV], J[DP, DTD] = -tells * dx[DTD] * J[DP, DP], -tells * J[DP, DP].dot(dx[DV])
         P = J.dot(self.P).dot(J.T)
         self.P = 0.5 * (P + P.T)
-        # A step of Newton's towards Rᵀ R = I keeps the rotation one.
-        R = self.rotation.dot(exp)
-        self.rotation = R.dot(1.5 * _I3 - 0.5 * R.T.dot(R))
+        attitude = _turned(self.attitude, turn)
+        self.face(attitude / math.sqrt(attitude.dot(attitude)))
 
     def start(self, hypothesis: Array, velocity_sigma: float, rate: Array) -> None:
-        """Pose and its covariance from a fix, turning at `rate` (3,); the other states stay."""
-        self.rotation = rotation_from_quaternion(hypothesis[k.H_QUAT : k.H_QUAT + 4])
+        """Pose and its covariance from a fix, at an angular rate (3,); the other states stay."""
+        self.face(hypothesis[k.H_QUAT : k.H_QUAT + 4].copy())
         self.position = hypothesis[k.H_POS : k.H_POS + 3].copy()
         self.velocity = np.zeros(3)
         P = self.P.copy()
@@ -219,6 +249,11 @@ def _order(reading: tuple[float, ...]) -> list[float]:
     return [math.inf if math.isnan(number) else number for number in reading]
 
 
+def _repeated(now: Sequence[float], last: Sequence[float], peak: float, least: float) -> int:
+    """Along how many axes a reading, `peak` at most, is to the last digit what it was, and at least `least`."""
+    return 0 if peak < least else sum([a == b and abs(a) >= least for a, b in zip(now, last, strict=True)])
+
+
 def _d2(S: Array, y: Array) -> float:
     return float(y @ np.linalg.solve(S, y))
 
@@ -245,8 +280,9 @@ class _State:
         self.excess, self.scale, self.last_innovation = [0.0] * 4, [1.0] * 4, np.zeros(6)
         self.still_since, self.still_barred, self.still_sure, self.still_fixes = math.inf, -math.inf, False, 0
         self.still_mean, self.still_force = np.zeros(3), np.zeros(3)
-        self.rest, self.moving = [0.0, 0.0], [0.0, 0.0]  # of gyro and accelerometer, like all pairs that follow
-        self.change, self.largest, self.clipped = [0.0, 0.0], [0.0, 0.0], [0, 0]
+        self.rest, self.moving = [0.0, 0.0], [0.0, 0.0]  # of gyro and accelerometer
+        self.change_gyro = self.change_accel = self.largest_gyro = self.largest_accel = 0.0
+        self.clipped_gyro = self.clipped_accel = 0
         self.same_run, self.suspect, self.blind = 0, False, False
         self.constraint_nis, self.usual_speed2 = np.ones(4), 0.0
         self.adapted, self.t_adapted = 0.0, -math.inf
@@ -257,9 +293,9 @@ class _State:
         self.place, self.place2, self.place_count = np.zeros(3), np.zeros(3), 0
 
     def copy(self) -> _State:
-        other = copy.copy(self)
-        other.main = copy.copy(self.main)
-        other.shadow = copy.copy(self.shadow)
+        other = _shallow_copy(self)
+        other.main = _shallow_copy(self.main)
+        other.shadow = None if self.shadow is None else _shallow_copy(self.shadow)
         return other
 
     @property
@@ -296,7 +332,7 @@ class ReferenceTimeline:
         """(kernels.STATE,): the live filter in the kernels' layout."""
         s = self._state
         vector = np.zeros(k.STATE)
-        vector[k.Q : k.Q + 4] = quaternion_from_rotation(s.main.rotation)
+        vector[k.Q : k.Q + 4] = s.main.attitude
         vector[k.V : k.V + 3] = s.main.velocity
         vector[k.POS : k.POS + 3] = s.main.position
         vector[k.BG : k.BG + 3], vector[k.BA : k.BA + 3] = s.main.bias[:3], s.main.bias[3:]
@@ -323,11 +359,11 @@ class ReferenceTimeline:
                 if not state.initialised:
                     row[1:] = np.nan
                     continue
-                position, rotation = state.main.position, state.main.rotation
+                row[1:4], row[4:] = state.main.position, state.main.attitude
                 if channel == "smooth":
                     e = self._smoother.offset(state.t)
-                    position, rotation = position + e[:3], exp_so3(e[3:]) @ rotation
-                row[1:4], row[4:] = position, quaternion_from_rotation(rotation)
+                    row[1:4] += e[:3]
+                    row[4:] = quaternion_from_rotation(exp_so3(e[3:]) @ state.main.rotation)
         return kept
 
     def feed_wheels(self, samples: Array) -> int:
@@ -386,14 +422,9 @@ class ReferenceTimeline:
 
     def _absorb(self, before: tuple[bool, int, int, Array, Moving]) -> None:
         started, rewinds, cursor, corrected, moving = before
-        if not started:
-            self._smoother.start(self._state.t)
-            return
         now = self._state.main.corrected
         plain = self._figures["rewinds"] == rewinds and self._state.fix_cursor == cursor
-        if plain and now is corrected:
-            self._smoother.glide(self._state.t)
-        else:
+        if started and not (plain and now is corrected):
             self._smoother.absorb(moving, self._moving(), now - corrected if plain else None)
 
     def pose_at(self, t: float, channel: Channel = "best") -> Array | None:
@@ -414,13 +445,16 @@ class ReferenceTimeline:
                 self._run_to(state, t, fixes, readings)
         elif state.initialised or fixes:
             state.next_t, state.next_u = math.inf, state.u
-            fresh = min(t, state.t_imu + self._params.imu_gap)
-            for bridging, leg in ((False, fresh), (True, t)):
+            fresh = state.t_imu + self._params.imu_gap
+            # A pause that is known to be one is bridged from its start.
+            legs = [(False, min(t, fresh)), (True, t)] if self._horizon <= fresh else [(True, t)]
+            for bridging, leg in legs:
                 if leg > state.t:
                     state.bridging = bridging
                     self._run_to(state, leg, fixes, readings)
         if not state.initialised:
             return None
+        self._settle(state)
         out = self._pose(state)
         if channel == "smooth":
             out[k.P_RESET_ID], out[k.P_STEP : k.P_STEP + 6] = self._smoother.resets, self._smoother.step
@@ -508,51 +542,44 @@ class ReferenceTimeline:
 
     def _head_for(self, state: _State, sample: tuple[float, ...]) -> None:
         """See `kernels._next_sample`."""
-        state.next_t = sample[0]
-        rate, read = sample[1:4], sample[4:]
-        force2 = sum([f * f for f in read])
-        scale = 1.0
+        state.next_t, rate, force = sample[0], sample[1:4], sample[4:]
+        force2 = math.hypot(*force) ** 2
         if self._motion != "free" and state.force_count and not k.LEAST_FORCE2 < state.force2 < k.MOST_FORCE2:
             scale = GRAVITY / math.sqrt(max(state.force2, 1e-4 * GRAVITY**2))
-        force = [scale * f for f in read]
-        u = state.u.tolist()
-        changes = ([a - b for a, b in zip(rate, u, strict=False)], [a - b for a, b in zip(force, u[3:], strict=True)])
-        squared = [sum([c * c for c in change]) for change in changes]
-        clipped, saturated = list(state.clipped), False
-        largest = [max(map(abs, rate)), max(map(abs, force))]
-        for i, (change, now, least) in enumerate(
-            zip(changes, (rate, force), (k.SATURATED_GYRO, k.SATURATED_ACCEL), strict=True)
-        ):
-            if 0.0 in change:
-                for c, value in zip(change, now, strict=True):
-                    if c == 0.0 and abs(value) >= max(state.largest[i], least):
-                        clipped[i] += 1
-                        saturated |= clipped[i] >= k.CLIPPED_OFTEN
+            force = tuple([scale * f for f in force])
+        last = state.u.tolist()
+        gyro, accel = math.dist(rate, last[:3]) ** 2, math.dist(force, last[3:]) ** 2
+        fastest, hardest = max(map(abs, rate)), max(map(abs, force))
+        # of both sensors: so often has a reading that is the largest ever come twice in a row
+        turns = _repeated(rate, last[:3], fastest, max(state.largest_gyro, k.SATURATED_GYRO))
+        pushes = _repeated(force, last[3:], hardest, max(state.largest_accel, k.SATURATED_ACCEL))
+        state.clipped_gyro += turns
+        state.clipped_accel += pushes
+        saturated = turns > 0 and state.clipped_gyro >= k.CLIPPED_OFTEN
+        saturated |= pushes > 0 and state.clipped_accel >= k.CLIPPED_OFTEN
         state.same_run += 1
-        if squared[0] + squared[1]:
+        if gyro + accel:
             state.same_run = 0
             state.force_count = min(state.force_count + 1, k.FORCE_SAMPLES)
             state.force2 += (min(force2, 100.0 * GRAVITY**2) - state.force2) / state.force_count
         state.bridging = sample[0] - state.t_imu > self._params.imu_gap or state.same_run >= k.STUCK_AFTER
-        known = state.largest[1] > 0.0
-        # of both sensors: what one sample alone may change by, and what none can
-        spike = squared[0] > max(k.SPIKE**2 * state.change[0], k.SPIKE_GYRO**2)
-        spike |= squared[1] > max(k.SPIKE**2 * state.change[1], k.SPIKE_ACCEL**2)
-        if (
-            squared[0] > k.IMPOSSIBLE_GYRO**2
-            or squared[1] > k.IMPOSSIBLE_ACCEL**2
-            or (spike and not state.suspect and known)
-        ):
-            state.suspect = True
+        # what one sample alone may change by, and what none can
+        spike = gyro > max(k.SPIKE**2 * state.change_gyro, k.SPIKE_GYRO**2)
+        spike |= accel > max(k.SPIKE**2 * state.change_accel, k.SPIKE_ACCEL**2)
+        known = state.largest_accel > 0.0
+        impossible = gyro > k.IMPOSSIBLE_GYRO**2 or accel > k.IMPOSSIBLE_ACCEL**2
+        state.suspect = impossible or (spike and not state.suspect and known)
+        if state.suspect:
             state.next_u = state.u
         else:
-            state.suspect = False
-            state.next_u = np.array([*rate, *force])
+            state.next_u = np.array(rate + force)
             if known:
-                state.change = [c + 0.02 * (square - c) for c, square in zip(state.change, squared, strict=True)]
-            clipped = [0 if new > old else c for new, old, c in zip(largest, state.largest, clipped, strict=True)]
-            state.largest = [max(new, old) for new, old in zip(largest, state.largest, strict=True)]
-        state.clipped = clipped
+                state.change_gyro += 0.02 * (gyro - state.change_gyro)
+                state.change_accel += 0.02 * (accel - state.change_accel)
+            if fastest > state.largest_gyro:
+                state.largest_gyro, state.clipped_gyro = fastest, 0
+            if hardest > state.largest_accel:
+                state.largest_accel, state.clipped_accel = hardest, 0
         state.blind = saturated or state.suspect
 
     def _advance(self, state: _State, until: float, live: bool) -> None:
@@ -615,6 +642,9 @@ class ReferenceTimeline:
                     self._move(state, f, 0.5 * (state.u + ahead), t, dt)
                 state.u = ahead
                 state.t = t
+            due = reading is not None or fix is not None
+            if due or state.main.lag > k.LONGEST_LAG or math.floor(t * k.GRID_HZ) != state.grid_at:
+                self._settle(state)
             if reading is not None:
                 for f in state.filters if state.initialised else []:
                     self._odometry(state, f, reading)
@@ -635,21 +665,26 @@ class ReferenceTimeline:
     def _move(self, state: _State, f: ErrorStateFilter, u: Array, t: float, dt: float) -> None:
         """Carry a filter on to t, by the IMU's u (6,), or by itself while there is none."""
         p = self._params
-        walks = (p.gyro_bias_walk, p.accel_bias_walk)
         if state.bridging:
             # straight on, unless the wheels say how it turns
             turns = t - state.t_wheel <= p.imu_gap
             rate = [0.0, 0.0, state.wheel_rate if turns else 0.0]
             rate_noise = p.wheel_rate_sigma / math.sqrt(k.GRID_HZ) if turns else p.no_imu_rate_noise
             force = GRAVITY * f.rotation.T @ f.up
-            f.move(f.bias + np.concatenate([rate, force]), dt, (rate_noise, 0.0, *walks))
+            f.move(f.bias + np.concatenate([rate, force]), dt, rate_noise, 0.0)
+            f.spread(p.gyro_bias_walk, p.accel_bias_walk)
             f.slow(dt, p.no_imu_accel_noise)
             return
-        shaken = math.sqrt(state.change[1] / 6.0 * min(state.next_t - state.t_imu, p.imu_gap))
+        shaken = math.sqrt(state.change_accel / 6.0 * min(state.next_t - state.t_imu, p.imu_gap))
         white = (p.gyro_noise * state.scale[1], max(p.accel_noise * state.scale[0], shaken - 2.0 * p.accel_noise))
         if state.blind:
-            white = (state.largest[0] * k.BLIND_TIME, state.largest[1] * k.BLIND_TIME)
-        f.move(u, dt, (*white, *walks))
+            white = (state.largest_gyro * k.BLIND_TIME, state.largest_accel * k.BLIND_TIME)
+        f.move(u, dt, *white)
+
+    def _settle(self, state: _State) -> None:
+        """Bring the covariances up to t, for whatever reads or changes them."""
+        for f in state.filters:
+            f.spread(self._params.gyro_bias_walk, self._params.accel_bias_walk)
 
     # --- measurements
 
@@ -704,7 +739,7 @@ class ReferenceTimeline:
         scores = []
         for i in range(int(fix[k.F_COUNT])):
             H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
-            S = H @ f.P @ H.T + self._noise(state, f, R)
+            S = H @ f.P @ H.T + self._rescaled(state, R)
             scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
         return float(min(scores))
 
@@ -731,7 +766,7 @@ class ReferenceTimeline:
         for i in range(int(fix[k.F_COUNT])):
             H, y, R = f.fix_model(self._hypothesis(fix, i), rate, self._params.stamp_jitter)
             models.append((H, y, R))
-            S = H @ f.P @ H.T + self._noise(state, f, R)
+            S = H @ f.P @ H.T + self._rescaled(state, R)
             scores.append(_d2(S, y) + np.linalg.slogdet(S)[1] + self._hypothesis(fix, i)[k.H_MISFIT])
         chosen = int(np.argmin(scores))
         margin = abs(scores[0] - scores[1]) if len(scores) == 2 else math.inf
@@ -739,7 +774,7 @@ class ReferenceTimeline:
         if margin < self._params.hypothesis_margin:
             B = f.rotation
             R[3:, 3:] += k.UNKNOWN_TILT_SIGMA**2 * (np.outer(B[0], B[0]) + np.outer(B[1], B[1]))
-        R = self._noise(state, f, R)
+        R = self._rescaled(state, R)
         S = H @ f.P @ H.T + R
         fix[k.F_D2] = _d2(S, y)
         fix[k.F_D2_POSITION] = _d2(S[:3, :3], y[:3])
@@ -755,10 +790,9 @@ class ReferenceTimeline:
         return np.zeros(3) if state.bridging else state.u[:3] - f.gyro_bias
 
     @staticmethod
-    def _noise(state: _State, f: ErrorStateFilter, R: Array) -> Array:
-        """R by its scale, and the product of the errors of speed and time offset, which H leaves out."""
+    def _rescaled(state: _State, R: Array) -> Array:
         R = R.copy()
-        R[:3, :3] = state.scale[2] * R[:3, :3] + f.P[DTD, DTD] * f.P[DV, DV]
+        R[:3, :3] *= state.scale[2]
         R[3:, 3:] *= state.scale[3]
         return R
 
@@ -868,7 +902,7 @@ class ReferenceTimeline:
                 patient or not known or self._attitudes_agree(state, main, shadow)
             )
         else:
-            shadow = copy.copy(main)
+            shadow = _shallow_copy(main)
             if not known:
                 shadow = ErrorStateFilter()
                 shadow.P = self._prior()
@@ -906,7 +940,8 @@ class ReferenceTimeline:
             off = off - mean
             variances = (np.einsum("ij,ij->j", off, off) / (n - 1)).tolist()
             scatter = [sum(variances[:3]), sum(variances[3:])]
-            state.still_mean, force = np.split(window[-1] + mean, 2)
+            middle = window[-1] + mean
+            state.still_mean, force = middle[:3], middle[3:]
             if math.isinf(state.still_since):
                 state.still_force = force
             pushed = math.dist(force, state.still_force)
@@ -983,8 +1018,9 @@ class ReferenceTimeline:
         m = len(y)
         if f is state.main and ground and not still:
             state.constraint_nis = state.constraint_nis.copy()
+            meant = [sigma**2 for sigma in (*sigmas, p.wheel_velocity_sigma)]
             for i, row in enumerate([m - 3, m - 2, m - 1, axes.index(1)] if wheels else [m - 3, m - 2, m - 1]):
-                expected = variances[row] + H[row] @ f.P @ H[row]
+                expected = meant[i] * loose[i] + H[row] @ f.P @ H[row]
                 now = min(y[row] ** 2 / expected, 9.0) * loose[i]
                 state.constraint_nis[i] += 0.05 * (now - state.constraint_nis[i])
         if m:
@@ -1029,7 +1065,7 @@ class ReferenceTimeline:
         out = np.zeros(k.POSE)
         out[k.P_T] = state.t
         out[k.P_POS : k.P_POS + 3] = f.position
-        out[k.P_QUAT : k.P_QUAT + 4] = quaternion_from_rotation(f.rotation)
+        out[k.P_QUAT : k.P_QUAT + 4] = f.attitude
         out[k.P_VEL : k.P_VEL + 3] = f.velocity
         out[k.P_RATE : k.P_RATE + 3] = 0.0 if state.bridging else state.u[:3] - f.gyro_bias
         turn = np.kron(np.eye(2), f.rotation)

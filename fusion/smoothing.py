@@ -49,10 +49,6 @@ class Smoother:
         self.resets = 0
         self.step = np.zeros(6)
 
-    def start(self, t: float) -> None:
-        """Before the first fix there is nothing to smooth."""
-        self._t = t
-
     def _left(self, t: float) -> list[float]:
         dt = t - self._t
         if dt <= 0.0:
@@ -80,12 +76,6 @@ class Smoother:
         self._published = max(self._published, t)
         return self.offset(t)
 
-    def glide(self, t: float) -> None:
-        """Let E decay until t, when nothing moves the pose but the IMU."""
-        if t > self._t:
-            self._e = self._left(t)
-            self._t = t
-
     def absorb(self, before: Motion, after: Motion, corrected: Array | None) -> None:
         """Take what an input has done to the filter's pose into E.
 
@@ -95,8 +85,8 @@ class Smoother:
         at = after.t
         if corrected is None:
             at = min(max(self._published, after.t), after.t + k.SMOOTH_REACH)
-        self.glide(at)
-        e = np.array(self._e)
+        e = self.offset(at)
+        self._t = max(at, self._t)
         if corrected is not None:
             e = e - corrected
         else:

@@ -7,12 +7,14 @@ sensor's axes as its gyroscope says.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.measurements import Array
 from fusion.params import GRAVITY
@@ -94,7 +96,47 @@ class Rest(NamedTuple):
     gyro_noise: float
 
 
-_DEVICE, _T, _ARRIVAL, _GYRO, _FORCE = 0, 1, 2, slice(3, 6), slice(6, 9)
+class _Window:
+    """Samples as (9, n): by the device's clock, as stamped, arrival, rates, forces. One row a quantity: reductions
+    along what lies side by side in memory are several times as fast."""
+
+    def __init__(self, rows: Array) -> None:
+        self.device, self.t, self.arrival = rows[:3]
+        self.readings, self.gyro, self.force = rows[3:], rows[3:6], rows[6:]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @functools.cached_property
+    def as_arrived(self) -> bool:
+        """Whether there are samples whose stamps say no more than when they came."""
+        return bool(np.isnan(self.device).any())
+
+    @functools.cached_property
+    def steps(self) -> Array:
+        """s between samples: by the device's clock where it has one, else as they were stamped on arrival."""
+        steps: Array = np.diff(self.t if self.as_arrived else self.device)
+        return steps[steps > 0.0]
+
+    @functools.cached_property
+    def step(self) -> float:
+        """s: the usual one; NaN where there is none."""
+        if not len(self.steps):
+            return math.nan
+        if self.as_arrived:
+            # They come in bunches: their number over their time.
+            return float(self.steps.sum()) / (len(self) - 1)
+        return float(np.median(self.steps))
+
+    @functools.cached_property
+    def newest(self) -> NDArray[np.intp]:
+        """Which are the newest of their arrival, those that took least."""
+        return np.flatnonzero((np.diff(self.arrival, append=np.inf) > 0.0) & np.isfinite(self.arrival))
+
+    @functools.cached_property
+    def gravity(self) -> float:
+        """What it mostly reads of it."""
+        return float(np.median(_sizes(self.force)))
 
 
 class StreamHealth:
@@ -109,7 +151,7 @@ class StreamHealth:
         self.parser = parser
         self.port = port
         self.samples = 0
-        self._ring = np.full((2 * KEEP, 9), np.nan)
+        self._ring = np.empty((9, 2 * KEEP))
         self._end = 0
 
     def feed(self, raw: Sequence[Reading], readings: Array, arrival: float = math.nan) -> None:
@@ -124,58 +166,34 @@ class StreamHealth:
             raw, readings = raw[-KEEP:], readings[-KEEP:]
         self.samples += n
         n = len(readings)
-        if self._end + n > len(self._ring):
-            self._ring[:KEEP] = self._ring[self._end - KEEP : self._end]
+        if self._end + n > 2 * KEEP:
+            self._ring[:, :KEEP] = self._ring[:, self._end - KEEP : self._end]
             self._end = KEEP
-        rows = self._ring[self._end : self._end + n]
-        rows[:, _DEVICE] = [math.nan if sample[0] is None else sample[0] for sample in raw]
-        rows[:, _T] = readings[:, 0]
-        rows[:, _ARRIVAL] = arrival
-        rows[:, 3:] = readings[:, 1:]
+        rows = self._ring[:, self._end : self._end + n]
+        rows[0] = [sample[0] for sample in raw]  # None becomes NaN.
+        rows[1] = readings[:, 0]
+        rows[2] = arrival
+        rows[3:] = readings[:, 1:].T
         self._end += n
 
-    def _window(self) -> Array:
-        """(n, 9): the rows of the last WINDOW seconds."""
-        rows = self._ring[max(0, self._end - KEEP) : self._end]
-        if not len(rows) or math.isnan(rows[-1, _T]):
-            return rows
-        recent: Array = rows[rows[:, _T] > rows[-1, _T] - WINDOW]
-        return recent
+    def _window(self) -> _Window:
+        """The last WINDOW seconds."""
+        rows = self._ring[:, max(0, self._end - KEEP) : self._end]
+        t = rows[1]
+        old = np.flatnonzero(t <= t[-1:] - WINDOW)
+        return _Window(rows[:, old[-1] + 1 :] if len(old) else rows)
 
     def rest(self) -> Rest | None:
         """What the sensor reads at rest; None while it moves, or where too little is known."""
-        rows = self._window()
-        step = _step(rows)
-        if len(rows) < LEAST:
-            return None
-        size = max(4, round(REST_BLOCK / step)) if step > 0.0 else LEAST
-        count = len(rows) // size
-        blocks = rows[len(rows) - count * size :].reshape(count, size, 9)
-        means, scatter = blocks[:, :, _FORCE].mean(axis=1), blocks[:, :, _FORCE].std(axis=1)
-        gravity = float(np.linalg.norm(means[-1])) if count else 0.0
-        still = 0
-        while (
-            still < count
-            and scatter[-1 - still].max() <= REST_SCATTER * gravity
-            and np.abs(means[-1 - still] - means[-1]).max() <= REST_CHANGE * gravity
-        ):
-            still += 1
-        if still * size * step < 0.99 * REST or still < 2:
-            return None
-        at_rest = rows[len(rows) - still * size :]
-        gyro, force = at_rest[:, _GYRO], at_rest[:, _FORCE]
-        noise = float(np.diff(gyro, axis=0).std(axis=0).max()) / math.sqrt(2.0)
-        seconds = still * size * step
-        return Rest(seconds, gyro.mean(axis=0), gyro.std(axis=0), force.mean(axis=0), force.std(axis=0), noise)
+        return _rest(self._window())
 
     def figures(self) -> dict[str, Any]:
         """Plain values, None where nothing is known: of the last WINDOW seconds, `samples` and what is lost of all."""
-        rows, parser = self._window(), self.parser
-        step, rest = _step(rows), self.rest()
-        intervals, delays = _arrivals(rows)
-        steps = _steps(rows)
+        window, parser = self._window(), self.parser
+        step, steps, rest = window.step, window.steps, _rest(window)
+        intervals, delays = _arrivals(window)
         long = steps[steps > GAP * step]
-        force = rows[:, _FORCE].mean(axis=0) if len(rows) else np.full(3, np.nan)
+        force = window.force.mean(axis=1) if len(window) else np.full(3, np.nan)
         return {
             "samples": self.samples,
             "rate_hz": _finite(1.0 / step if step > 0.0 else math.nan),
@@ -187,7 +205,7 @@ class StreamHealth:
             "arrival_interval_ms": _finite(1e3 * float(np.median(intervals))) if len(intervals) else None,
             "delay_jitter_ms": _finite(1e3 * float(np.std(delays))) if len(delays) > 1 else None,
             "gravity": _finite(float(np.linalg.norm(force))),
-            "gravity_direction": _direction(force) if len(rows) else None,
+            "gravity_direction": _direction(force) if len(window) else None,
             "rest": None
             if rest is None
             else {
@@ -203,21 +221,20 @@ class StreamHealth:
 
     def findings(self) -> list[Finding]:
         """What there is to say, what is wrong altogether first."""
-        rows = self._window()
+        window = self._window()
         found = list(self._of_parser())
-        steps = _steps(rows)
-        if len(rows) < LEAST or 0.0 < float(steps.sum()) < LEAST_SECONDS:
+        if len(window) < LEAST or 0.0 < float(window.steps.sum()) < LEAST_SECONDS:
             return found
-        rest = self.rest()
+        rest = _rest(window)
         derived = self.parser is not None and bool(self.parser.note)
-        found += _of_stuck(rows, ("sensor",) if derived else ("sensor", "gyroscope", "accelerometer"))
+        found += _of_stuck(window, ("sensor",) if derived else ("sensor", "gyroscope", "accelerometer"))
         if not any(finding.code == "imu_stuck" and finding.severity == "error" for finding in found):
-            found += _of_force(rows)
-            found += _of_rates(rows, rest)
+            found += _of_force(window)
+            found += _of_rates(window, rest)
         if rest is not None and self.upright:
             found += _of_gravity(rest)
-        found += _of_time(rows, steps)
-        found += self._of_batches(rows)
+        found += _of_time(window)
+        found += self._of_batches(window)
         order = ("error", "warning", "note")
         first = {finding.code: finding for finding in reversed(found)}
         return sorted(first.values(), key=lambda finding: order.index(finding.severity))
@@ -239,9 +256,9 @@ class StreamHealth:
             text = f"{share:.0%} of the frames that the device numbered never came: the line is too slow, or disturbed"
             yield Finding("imu_missing", "warning", text, {"share": share, "missing": parser.missing})
 
-    def _of_batches(self, rows: Array) -> Iterator[Finding]:
-        intervals, _ = _arrivals(rows)
-        step = _step(rows)
+    def _of_batches(self, window: _Window) -> Iterator[Finding]:
+        intervals, _ = _arrivals(window)
+        step = window.step
         if not self.port or len(intervals) < LEAST or not step > 0.0:
             return
         interval = float(np.median(intervals))
@@ -255,34 +272,56 @@ class StreamHealth:
         yield Finding("imu_batches", "note", text, {"interval_ms": ms, "samples": interval / step})
 
 
-def _of_stuck(rows: Array, names: Sequence[str]) -> Iterator[Finding]:
+def _rest(window: _Window) -> Rest | None:
+    step = window.step
+    if len(window) < LEAST:
+        return None
+    size = max(4, round(REST_BLOCK / step)) if step > 0.0 else LEAST
+    count = len(window) // size
+    if not count:
+        return None
+    blocks = window.force[:, -count * size :].reshape(3, count, size)
+    means = blocks.mean(axis=2)
+    gravity = math.hypot(*means[:, -1])
+    quiet = (blocks.std(axis=2) <= REST_SCATTER * gravity) & (np.abs(means - means[:, -1:]) <= REST_CHANGE * gravity)
+    moving = np.flatnonzero(~quiet.all(axis=0))
+    still = count - 1 - int(moving[-1]) if len(moving) else count
+    seconds = still * size * step
+    if seconds < 0.99 * REST or still < 2:
+        return None
+    gyro, force = window.gyro[:, -still * size :], window.force[:, -still * size :]
+    noise = float(np.diff(gyro).std(axis=1).max()) / math.sqrt(2.0)
+    return Rest(seconds, gyro.mean(axis=1), gyro.std(axis=1), force.mean(axis=1), force.std(axis=1), noise)
+
+
+def _of_stuck(window: _Window, names: Sequence[str]) -> Iterator[Finding]:
     """Readings that repeat themselves, which a sensor's noise does not allow; derived rates may well be all zero."""
-    t = rows[:, _T]
-    same = np.diff(rows[:, 3:], axis=0) == 0.0
+    t = window.t
+    same = np.diff(window.readings) == 0.0
     for name in names:
-        columns = {"sensor": slice(0, 6), "gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}[name]
-        changes = np.flatnonzero(~same[:, columns].all(axis=1))
+        rows = {"sensor": slice(0, 6), "gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}[name]
+        changes = np.flatnonzero(~same[rows].all(axis=0))
         first = int(changes[-1]) + 1 if len(changes) else 0
-        count = len(rows) - first
+        count = len(t) - first
         seconds = float(t[-1] - t[first])
         both = name == "sensor"
         if count >= STUCK_SAMPLES and not seconds < (STUCK_SECONDS if both else STUCK_SECONDS_OF_ONE):
-            values = ", ".join(f"{value:g}" for value in rows[-1, 3:][columns])
+            values = ", ".join(f"{value:g}" for value in window.readings[rows, -1])
             text = (
                 f"the {name} repeats itself: {values} for the last {count} samples; it is stuck, not read anew, or its "
                 "numbers are rounded too much"
             )
             yield Finding("imu_stuck", "error" if both else "warning", text, {"which": name, "samples": count})
             return
-    repeats = float(same.all(axis=1).mean())
+    repeats = float(same.all(axis=0).mean())
     if repeats >= REPEATED:
         text = f"{repeats:.0%} of the readings are the ones before: the device sends faster than its sensor measures"
         yield Finding("imu_repeats", "warning", text, {"share": repeats})
 
 
-def _of_force(rows: Array) -> Iterator[Finding]:
+def _of_force(window: _Window) -> Iterator[Finding]:
     """In which unit gravity is read."""
-    force = float(np.median(np.linalg.norm(rows[:, _FORCE], axis=1)))
+    force = window.gravity
     if FORCE_RANGE[0] < force < FORCE_RANGE[1]:
         return
     evidence = {"force": force, "expected": GRAVITY}
@@ -304,12 +343,12 @@ def _unit(force: float) -> str:
     return next((words for one, words in UNITS if abs(force / one - 1.0) <= UNIT_SHARE), "")
 
 
-def _of_rates(rows: Array, rest: Rest | None) -> Iterator[Finding]:
+def _of_rates(window: _Window, rest: Rest | None) -> Iterator[Finding]:
     """In which unit, and about which axes, the gyroscope turns."""
-    rates = np.abs(rows[:, _GYRO])
-    beyond = int((rates.max(axis=1) > FULL_SCALE).sum())
+    rates = np.abs(window.gyro)
+    beyond = int((rates > FULL_SCALE).any(axis=0).sum())
     degrees = "these are deg/s, not rad/s"
-    turning = _Turning.of(rows) if _unit(float(np.median(np.linalg.norm(rows[:, _FORCE], axis=1)))) else None
+    turning = _Turning.of(window) if _unit(window.gravity) else None
     if turning is not None and turning.agreement > TURN_AGREE and turning.slope < 0.05:
         text = f"the gyroscope turns {1.0 / turning.slope:.0f} times as far as gravity does: {degrees}"
         yield Finding("gyro_unit", "error", text, {"times": 1.0 / turning.slope, "agreement": turning.agreement})
@@ -355,23 +394,22 @@ class _Turning:
         self.agreement, self.slope = self._compare(np.eye(3))
 
     @classmethod
-    def of(cls, rows: Array) -> _Turning | None:
+    def of(cls, window: _Window) -> _Turning | None:
         """None where gravity has turned too little to say anything."""
-        step = _step(rows)
+        step = window.step
         size = max(1, round(TURN_STEP / step)) if step > 0.0 else 0
-        count = len(rows) // size if size else 0
+        count = len(window) // size if size else 0
         if count < 4:
             return None
-        rows = rows[len(rows) - count * size :]
-        means = rows[:, _FORCE].reshape(count, size, 3).mean(axis=1)
+        means = window.force[:, -count * size :].reshape(3, count, size).mean(axis=2).T
         norms = np.linalg.norm(means, axis=1)
         if not norms.min() > 0.0:
             return None
         up = means / norms[:, np.newaxis]
         # The gyroscope's integral from the middle of one block to that of the next.
-        integral = np.concatenate([np.zeros((1, 3)), np.cumsum(rows[:, _GYRO], axis=0)]) * step
-        through = np.concatenate([integral[:1], 0.5 * (integral[1:] + integral[:-1])])
-        middles = through[1:].reshape(count, size, 3).mean(axis=1)
+        gyro = window.gyro[:, -count * size :]
+        through = (np.cumsum(gyro, axis=1) - 0.5 * gyro) * step
+        middles = through.reshape(3, count, size).mean(axis=2).T
         # Where something else than gravity acts, the direction says nothing.
         good = np.abs(norms / np.median(norms) - 1.0) < 0.1
         both = good[1:] & good[:-1]
@@ -417,18 +455,17 @@ def _of_gravity(rest: Rest) -> Iterator[Finding]:
     yield Finding("imu_mounting", "warning", text, evidence)
 
 
-def _of_time(rows: Array, steps: Array) -> Iterator[Finding]:
+def _of_time(window: _Window) -> Iterator[Finding]:
     """Stamps, gaps, and the pace of the device's clock against the host's."""
-    device = rows[:, _DEVICE]
-    # Of each arrival its newest sample, which took least.
-    newest = _newest(rows)
-    span = float(np.ptp(newest[:, _ARRIVAL])) if len(newest) else math.nan
+    device, steps, step = window.device, window.steps, window.step
+    arrival = window.arrival[window.newest]
+    span = float(np.ptp(arrival)) if len(arrival) else math.nan
     if np.isnan(device).all():
         if span >= 0.0:
             text = "it sends no time of its own: samples are stamped as they arrive, with all the jitter of the line"
             yield Finding("imu_unstamped", "note", text, {})
     else:
-        elapsed = float(newest[-1, _DEVICE] - newest[0, _DEVICE]) if len(newest) else math.nan
+        elapsed = float(device[window.newest[-1]] - device[window.newest[0]]) if len(arrival) else math.nan
         forward = bool((np.diff(device) >= 0.0).all())
         if not (np.diff(device) != 0.0).any():
             text = f"its time stands still at {device[-1]:g} s"
@@ -439,47 +476,25 @@ def _of_time(rows: Array, steps: Array) -> Iterator[Finding]:
             text = f"its time runs {times:.3g} times as fast as it should{': ' if units else ''}{units}"
             yield Finding("imu_stamp_unit", "error", text, {"times": times, "seconds": span})
             return
-    step = _step(rows)
     long = steps[steps > GAP * step]
     missing = float(np.sum(np.round(long / step) - 1.0)) if step > 0.0 else 0.0
-    if len(long) >= GAPS_LEAST and missing >= GAPS_SHARE * len(rows) and not np.isnan(device).any():
-        share = missing / (missing + len(rows))
+    if len(long) >= GAPS_LEAST and missing >= GAPS_SHARE * len(window) and not window.as_arrived:
+        share = missing / (missing + len(window))
         text = f"IMU samples are missing: {share:.0%} (gaps of up to {1e3 * long.max():.0f} ms)"
         yield Finding("imu_missing", "warning", text, {"share": share, "gaps": len(long)})
 
 
-def _steps(rows: Array) -> Array:
-    """s between samples: by the device's clock where it has one, else as they were stamped on arrival."""
-    column = _T if len(rows) and np.isnan(rows[:, _DEVICE]).any() else _DEVICE
-    steps: Array = np.diff(rows[:, column])
-    return steps[steps > 0.0]
-
-
-def _step(rows: Array) -> float:
-    """s: the usual one; NaN where there is none."""
-    column = _T if len(rows) and np.isnan(rows[:, _DEVICE]).any() else _DEVICE
-    steps = _steps(rows)
-    if not len(steps):
-        return math.nan
-    if column == _T:
-        # Stamped on arrival they come in bunches: their number over their time.
-        return float(steps.sum()) / (len(rows) - 1)
-    return float(np.median(steps))
-
-
-def _newest(rows: Array) -> Array:
-    """The rows that are the newest of their arrival."""
-    arrival = rows[:, _ARRIVAL]
-    newest: Array = rows[(np.diff(arrival, append=np.inf) > 0.0) & np.isfinite(arrival)]
-    return newest
-
-
-def _arrivals(rows: Array) -> tuple[Array, Array]:
+def _arrivals(window: _Window) -> tuple[Array, Array]:
     """s between arrivals, and s that the newest sample of each took, by its stamp, where the device stamped it."""
-    newest = _newest(rows)
-    intervals: Array = np.diff(newest[:, _ARRIVAL])
-    delays: Array = newest[:, _ARRIVAL] - newest[:, _T]
-    return intervals, delays[np.isfinite(newest[:, _DEVICE])]
+    arrival = window.arrival[window.newest]
+    delays: Array = arrival - window.t[window.newest]
+    return np.diff(arrival), delays[np.isfinite(window.device[window.newest])]
+
+
+def _sizes(vectors: Array) -> Array:
+    """Of vectors (3, n)."""
+    sizes: Array = np.sqrt(np.einsum("in,in->n", vectors, vectors))
+    return sizes
 
 
 def _direction(force: Array) -> str:

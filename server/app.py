@@ -42,7 +42,7 @@ from server.camera_messages import camera_hello
 from server.cameras import FIRST_PAUSE, LONGEST_PAUSE, Camera, Open, Seen, open_configured
 from server.clock_questions import ClockQuestions
 from server.config import CameraConfig, Config
-from server.hub import STALL_LIMIT, Hub, Subscription
+from server.hub import STALL_LIMIT, Hub, Subscription, Topic
 from server.listening import cannot_listen, response
 from server.messages import (
     FORMATS,
@@ -75,14 +75,16 @@ SAVED_UP = 5.0
 MAX_CONNECTIONS = 500
 # s before one who showed a wrong token is told, so that nobody can try many.
 WRONG_TOKEN_PAUSE = 1.0
+# The original stream; a robot's poses are ("own", its name), as it speaks, or (channel, its name, format), for viewers.
+TRACKER: Topic = ("tracker",)
 # Bytes of the original stream that may wait for a client: there each message counts, so some may.
 TRACKER_ROOM = 64 * 1024
 # s without a word after which a robot's connection is taken for dead, and another may take its place.
 SILENCE = 3.0
 # s until a robot must have said who it is.
 HELLO_TIMEOUT = 10.0
-# s between two diagnoses of each robot: one takes some milliseconds.
-DIAGNOSE_EVERY = 5.0
+# s between two rounds of diagnoses; and their share of the loop's time within one, since each takes some milliseconds.
+DIAGNOSE_EVERY, DIAGNOSE_SHARE = 5.0, 0.05
 # s that a camera waits for the filters' word; without it, it looks where the markers were last.
 POSES_TIMEOUT = 0.05
 # s that closing may take: for clients that do not answer, and for threads that hang in a driver.
@@ -197,7 +199,7 @@ class Service:
         published: Callable[[Pose], None] | None = None,
     ) -> None:
         self.config = config
-        self.hub = Hub()
+        self.hub = Hub(tick=1.0 / config.server.pose_rate_hz)
         self.robots = {robot.name: Robot(robot, recording) for robot in config.robot}
         self.cameras = {camera.name: self._camera(camera, open_camera) for camera in config.camera}
         self.refused = 0
@@ -260,7 +262,7 @@ class Service:
 
     def _camera(self, config: CameraConfig, open_camera: Open) -> Camera:
         def wanted() -> bool:
-            return self.hub.wants("tracker")
+            return self.hub.wants(TRACKER)
 
         if config.source == "remote":
             return RemoteCamera(config, self.config, self._deliver, wanted)
@@ -348,7 +350,7 @@ class Service:
     def _seen(self, seen: Seen) -> None:
         now = time.monotonic()
         for message in seen.tracker:
-            self.hub.publish(now, {"tracker": message})
+            self.hub.publish(now, {TRACKER: message}.get)
         if self.ready.is_set():
             for fix in seen.fixes:
                 self.robots[fix.robot].feed_fix(fix, now)
@@ -401,7 +403,7 @@ class Service:
         try:
             robot.connected(parser, imu.source)
             log.info("robot %s: %s is open", name, imu.source)
-            topics = [f"own/{name}"] if imu.pose_rate_hz > 0.0 else []
+            topics = [("own", name)] if imu.pose_rate_hz > 0.0 else []
             with self.hub.subscribed(
                 lambda data: port.write(data + b"\n"), lambda: 0, port.close, topics, imu.pose_rate_hz
             ):
@@ -413,43 +415,38 @@ class Service:
 
     async def _publish(self) -> None:
         await self.ready.wait()
-        period = 1.0 / self.config.server.pose_rate_hz
         due = time.monotonic()
         while True:
-            now = time.monotonic()
-            wanted = self.hub.due(now)
-            messages: dict[str, bytes] = {}
-            for name, robot in self.robots.items():
-                messages |= self._pose_messages(name, robot, now, wanted)
-            self.hub.publish(now, messages)
-            for _ in self.hub.sweep(now):
-                log.warning("a client took nothing for %.0f s and was cut off", STALL_LIMIT)
+            self._publish_poses(time.monotonic())
             # On schedule; after a pause from now, not in a burst.
-            due = max(due + period, now)
-            await asyncio.sleep(due - time.monotonic())
+            now = time.monotonic()
+            due = max(due + self.hub.tick, now)
+            await asyncio.sleep(due - now)
 
-    def _pose_messages(self, name: str, robot: Robot, now: float, wanted: set[str]) -> dict[str, bytes]:
-        own = f"own/{name}"
-        viewed = {
-            channel: formats
-            for channel in get_args(Channel)
-            if (formats := [format for format in FORMATS if f"{channel}/{name}/{format}" in wanted])
-        }
-        if not viewed and own not in wanted and self._published is None:
-            return {}
-        pose = self._pose(robot, now)
-        if pose is None:
-            return {}
-        messages = {}
-        if own in wanted:
-            link = self._links.get(name)
-            messages[own] = robot.encode_own(pose, now, link.visitor.dialect if link is not None else Dialect())
-        for channel, formats in viewed.items():
-            shown = pose if channel == "smooth" else robot.localiser.pose_at(now, channel)
-            if shown is not None:
-                message = robot.message(shown, now)
-                messages |= {f"{channel}/{name}/{format}": FORMATS[format](message) for format in formats}
-        return messages
+    def _publish_poses(self, now: float) -> None:
+        # What robots steer by: given out once, to whomever.
+        given: dict[str, Pose | None] = {}
+        if self._published is not None:
+            given = {name: self._pose(robot, now) for name, robot in self.robots.items()}
+
+        def message(topic: Topic) -> bytes | None:
+            if topic == TRACKER:
+                return None
+            channel, name, *format = topic
+            robot = self.robots[name]
+            if name not in given:
+                given[name] = self._pose(robot, now)
+            pose = robot.localiser.pose_at(now) if channel == "best" else given[name]
+            if pose is None:
+                return None
+            if channel == "own":
+                link = self._links.get(name)
+                return robot.encode_own(pose, now, link.visitor.dialect if link is not None else Dialect())
+            return FORMATS[format[0]](robot.message(pose, now))
+
+        self.hub.publish(now, message)
+        for _ in self.hub.sweep(now):
+            log.warning("a client took nothing for %.0f s and was cut off", STALL_LIMIT)
 
     def _pose(self, robot: Robot, now: float) -> Pose | None:
         pose = robot.publish(now)
@@ -462,9 +459,10 @@ class Service:
         while True:
             await asyncio.sleep(DIAGNOSE_EVERY)
             for name, robot in self.robots.items():
-                for text in robot.diagnose(time.monotonic()):
+                begin = time.monotonic()
+                for text in robot.diagnose(begin):
                     self._note(name, text)
-                await asyncio.sleep(0.0)  # Poses go out between two of them.
+                await asyncio.sleep((time.monotonic() - begin) / DIAGNOSE_SHARE)
             for name, camera in self.cameras.items():
                 for text in camera.news(time.monotonic()):
                     log.info("camera %s: %s", name, text)
@@ -619,7 +617,7 @@ class Service:
             raise RefusedError(f"this is not the token of {whose}")
 
     async def _serve_tracker(self, visitor: _Visitor) -> None:
-        with self._client(visitor, ["tracker"], room=TRACKER_ROOM):
+        with self._client(visitor, [TRACKER], room=TRACKER_ROOM):
             while True:
                 await visitor.receive()  # the original ignored what its clients sent
 
@@ -631,7 +629,7 @@ class Service:
             await self._admit(visitor, token, self.config.server.token, "[server]")
         robots, rate_hz, channel, format = self._poses_query(query)
         visitor.dialect = Dialect(binary=format == "msgpack")
-        with self._client(visitor, [f"{channel}/{robot}/{format}" for robot in robots], rate_hz):
+        with self._client(visitor, [(channel, robot, format) for robot in robots], rate_hz):
             while True:
                 data = await visitor.receive()
                 with contextlib.suppress(MessageError):
@@ -673,7 +671,7 @@ class Service:
         return self.robots[name]
 
     def _client(
-        self, visitor: _Visitor, topics: Collection[str], rate_hz: float = 0.0, room: int = 0
+        self, visitor: _Visitor, topics: Collection[Topic], rate_hz: float = 0.0, room: int = 0
     ) -> AbstractContextManager[Subscription]:
         connection, text = visitor.connection, not visitor.dialect.binary
         transport = connection.transport
@@ -724,7 +722,7 @@ class Service:
         rate_hz = min(hello.pose_rate_hz, self.config.server.pose_rate_hz)
         visitor.tell_now(Welcome(hello.robot, SERVICE, rate_hz))
         log.info("robot %s has connected", hello.robot)
-        topics = [f"own/{hello.robot}"] if rate_hz > 0.0 else []
+        topics = [("own", hello.robot)] if rate_hz > 0.0 else []
         clock = asyncio.create_task(self._ask_clock(link))
         try:
             with self._client(visitor, topics, rate_hz) as subscription:
@@ -800,7 +798,7 @@ class Service:
     def _answer_robot(self, robot: Robot, link: _Link, subscription: Subscription) -> None:
         """Its pose at once, with what it just sent in it, as far as the rate that it asked for allows."""
         now = time.monotonic()
-        if subscription.topics and self.ready.is_set() and subscription.is_due(now, early=True):
+        if subscription.topics and self.ready.is_set() and subscription.is_due(now, early=subscription.interval):
             pose = self._pose(robot, now)
             if pose is not None:
                 self.hub.send(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))

@@ -19,7 +19,8 @@ from camera.boards import DEFAULT_BOARD, Board, BoardDetector, BoardView, parse_
 from camera.calibration import Calibration, CalibrationError, Criterion, calibrate, coverage, judge, save_intrinsics
 from camera.capture import IMAGE_SUFFIXES, FrameSource, open_source, read_image
 from camera.guide import Guide, Step
-from camera.markers import Pixels, grey
+from camera.images import Pixels, grey
+from camera.settings import CaptureSettings
 from server.calibration_page import CalibrationPage
 from server.listening import is_local, own_address, port_number, reachable
 
@@ -125,7 +126,12 @@ def _views(files: Iterator[Path], detector: BoardDetector) -> tuple[list[BoardVi
 class Guided:
     """The live camera with its guide, on the terminal and on the page."""
 
-    def __init__(self, args: argparse.Namespace, board: Board, open: Callable[..., FrameSource] = open_source) -> None:
+    def __init__(
+        self,
+        args: argparse.Namespace,
+        board: Board,
+        open: Callable[[str, CaptureSettings], FrameSource] = open_source,
+    ) -> None:
         self.guide = Guide(board)
         self._args = args
         self._open_source = open
@@ -177,7 +183,8 @@ class Guided:
         return status
 
     def _open(self) -> FrameSource:
-        return self._open_source(self._args.source, width_px=self._args.width_px, height_px=self._args.height_px)
+        settings = CaptureSettings(width_px=self._args.width_px, height_px=self._args.height_px)
+        return self._open_source(self._args.source, settings)
 
     def _see(self, image: Pixels) -> Step:
         """One picture, told on the terminal."""

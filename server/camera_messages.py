@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
+from camera.settings import CaptureSettings
 from imu.protocols import TIME_LIMIT
 from server.messages import ClockAnswer, ClockQuestion, Error, MessageError, Notice
 
@@ -30,24 +31,15 @@ class CameraHello(Struct, frozen=True, tag_field="type", tag="hello"):
     token: str = ""
 
 
-class CameraWelcome(Struct, frozen=True, tag_field="type", tag="welcome"):
-    """What the node is to look for, and how its camera is to be set: keys of the configuration's `[[camera]]`.
-
-    `ids`: of all markers; `still`: of those of them that lie on the floor.
-    """
+class CameraWelcome(CaptureSettings, frozen=True, tag_field="type", tag="welcome"):
+    """How the node's camera is to be set, and what it is to look for. `ids`: of all markers; `still`: of those of them
+    that lie on the floor."""
 
     camera: str
     service: str
     dictionary: str
     ids: list[int]
     still: list[int]
-    width_px: int
-    height_px: int
-    frame_rate_hz: float
-    pixel_format: str
-    exposure_ms: float
-    gain: float
-    line_time: float
 
 
 class MarkerSizes(Struct, frozen=True, tag_field="type", tag="sizes"):

@@ -14,13 +14,13 @@ import math
 import os
 import socket
 import ssl
-import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from urllib.parse import urlsplit
 
 import msgspec
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from camera.capture import Frame, FrameSource, open_source
@@ -36,19 +36,15 @@ from server.camera_messages import (
     encode,
     to_node,
 )
+from server.connecting import FIRST_PAUSE, LONGEST_PAUSE, connect_to_service, longer
+from server.frames import FrameThread
 from server.messages import ClockAnswer, ClockQuestion, Error, MessageError, Notice
 from server.terminal import log_to_stderr, until_stopped
 
 log = logging.getLogger("steadfix.camera")
 
-# s before connecting, or opening the camera, again: the first pause, which doubles up to the longest.
-FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
-# s between asking the service for a sign of life, and until a connection without one is given up.
-PING_INTERVAL, PING_TIMEOUT = 2.0, 3.0
 # s until the service must have answered the hello.
 HELLO_TIMEOUT = 10.0
-# s without a frame after which the camera counts as lost.
-READ_TIMEOUT = 5.0
 STATUS_EVERY = 1.0
 # Bytes that may wait in the kernel: what does not leave is to be replaced by what is newer.
 UNSENT = 2 * 1024
@@ -61,9 +57,9 @@ class NodeError(ValueError):
 
 
 class Watch:
-    """A thread that opens a camera as the welcome says, again whenever it is lost, and looks for markers in each frame.
+    """A camera that is opened as the welcome says, again whenever it is lost, and the markers in each of its frames.
 
-    `seen` gets what each frame showed, in that thread; `ended` is called there when a file is at its end. `trouble`
+    `seen` gets what each frame showed, in a thread; `ended` is called there when a file is at its end. `trouble`
     says in words what keeps it from its work, "" for nothing. Raises NodeError for a welcome that cannot be followed.
     """
 
@@ -73,17 +69,14 @@ class Watch:
         self.welcome = welcome
         self.trouble = "the camera is being opened"
         self.meter = DeliveryMeter()
-        self._open = open
         self._seen = seen
-        self._ended = ended
         try:
             self._tracker = MarkerTracker(welcome.dictionary, welcome.ids, welcome.still)
         except ValueError as error:
             raise NodeError(f"the service's welcome: {error}") from None
-        self._source: FrameSource | None = None
-        self._stop = threading.Event()
-        # A daemon: a driver that hangs must not keep the node from ending.
-        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
+        self._thread = FrameThread(
+            "camera", lambda: open(welcome), self._look, self._lost, ended, (FIRST_PAUSE, LONGEST_PAUSE)
+        )
         self._thread.start()
 
     def sizes_px(self, shortest_px: float, longest_px: float) -> None:
@@ -92,42 +85,13 @@ class Watch:
 
     def stop(self) -> None:
         """End the thread, and wait a moment for it to let go of the camera."""
-        self._stop.set()
-        if (source := self._source) is not None:
-            # Wakes a read that waits for a frame. It may itself wait for a driver that hangs.
-            threading.Thread(target=source.close, daemon=True).start()
+        self._thread.stop()
         self._thread.join(1.0)
 
-    def _run(self) -> None:
-        pause = FIRST_PAUSE
-        while not self._stop.is_set():
-            try:
-                if self._watch():
-                    self._ended()
-            except OSError as error:
-                trouble = str(error)
-            except Exception as error:
-                # A mistake of ours must not be hidden, nor end the node.
-                trouble = f"stopped by an error inside Steadfix: {error!r}"
-                log.debug("camera", exc_info=True)
-            else:
-                return
-            pause = min(2.0 * pause, LONGEST_PAUSE) if self.trouble else FIRST_PAUSE
-            if trouble != self.trouble:
-                log.warning("%s; trying again until it works", trouble)
-            self.trouble = trouble
-            self._stop.wait(pause)
-
-    def _watch(self) -> bool:
-        """Work until the source ends (True), is to stop (False) or is lost (OSError)."""
-        source = self._source = self._open(self.welcome)
-        try:
-            while (frame := source.read(READ_TIMEOUT)) is not None and not self._stop.is_set():
-                self._look(frame)
-            return not self._stop.is_set()
-        finally:
-            self._source = None
-            source.close()
+    def _lost(self, trouble: str) -> None:
+        if trouble != self.trouble:
+            log.warning("%s; trying again until it works", trouble)
+        self.trouble = trouble
 
     def _look(self, frame: Frame) -> None:
         start = time.monotonic()
@@ -196,15 +160,7 @@ class Node:
         while not self._ended.is_set():
             welcomed = False
             try:
-                async with connect(
-                    self._url,
-                    compression=None,
-                    max_size=1 << 16,
-                    ping_interval=PING_INTERVAL,
-                    ping_timeout=PING_TIMEOUT,
-                    proxy=None,
-                    ssl=self._tls,
-                ) as connection:
+                async with connect_to_service(self._url, self._tls) as connection:
                     await self._begin(connection)
                     welcomed = True
                     log.info("connected to %s as camera %s", self._url, self._name)
@@ -229,7 +185,7 @@ class Node:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._ended.wait()
-            pause = min(2.0 * pause, LONGEST_PAUSE)
+            pause = longer(pause)
 
     async def _begin(self, connection: ClientConnection) -> None:
         """Hello and welcome; the camera is opened if it is not, or with other settings than now wanted."""
@@ -375,23 +331,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command. Raises NodeError, and OSError for nothing: what is lost is tried again."""
     log_to_stderr()
-
-    def open_here(welcome: CameraWelcome) -> FrameSource:
-        return open_source(
-            args.source,
-            width_px=welcome.width_px,
-            height_px=welcome.height_px,
-            frame_rate_hz=welcome.frame_rate_hz,
-            pixel_format=welcome.pixel_format,
-            exposure=1e-3 * welcome.exposure_ms,
-            gain=welcome.gain,
-            line_time=welcome.line_time,
-        )
-
-    asyncio.run(_run(args, open_here))
+    asyncio.run(_run(args))
     return 0
 
 
-async def _run(args: argparse.Namespace, open: Open) -> None:
-    node = Node(args.server, args.name, open, args.token, args.certificate)
+async def _run(args: argparse.Namespace) -> None:
+    node = Node(args.server, args.name, partial(open_source, args.source), args.token, args.certificate)
     await until_stopped(node.run())

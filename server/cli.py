@@ -15,7 +15,7 @@ from typing import NoReturn
 # hence this place; a user's own setting stays.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Imported only when asked for: `steadfix detect` must not wait for the filter's compiler.
+# Imported only when asked for: most have no need of the filter, nor `steadfix markers` of a compiler.
 COMMANDS = {
     "run": ("server.run", "the service: cameras and IMUs in, poses out; without a configuration a simulated room"),
     "camera": ("server.camera_node", "the node of a remote camera: captures here, for a service elsewhere"),

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from camera.settings import CaptureSettings
 from fusion.params import Engine, FilterParams, Motion
 from imu.mounting import ImuCalibration
 from imu.protocols.csv_lines import ColumnsError, parse_columns
@@ -59,23 +60,12 @@ class ServerConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """Web pages of other addresses that may connect, such as "https://panel.example"."""
 
 
-class CameraConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class CameraConfig(CaptureSettings, frozen=True, forbid_unknown_fields=True):
     name: Name
     source: Annotated[int, Meta(ge=0)] | Text
     calibration: Text
     """Path of the intrinsics; `load` makes it absolute, and `source` too where that is a path."""
     dictionary: Text = "4X4_50"
-    width_px: Annotated[int, Meta(ge=0, le=20000)] = 0
-    height_px: Annotated[int, Meta(ge=0, le=20000)] = 0
-    frame_rate_hz: RateOrNone = 0.0
-    pixel_format: Annotated[str, Meta(pattern=r"^([A-Za-z0-9]{4})?$")] = ""
-    """Of a USB camera, such as MJPG; "": the camera's own."""
-    exposure_ms: Annotated[float, Meta(ge=0.0, le=1000.0)] = 0.0
-    """0: the camera's own, which is fixed for the Pi's and automatic for others."""
-    gain: Annotated[float, Meta(ge=0.0, le=10000.0)] = 0.0
-    """A factor for the Pi's camera, the driver's own number for others; 0: the camera's own."""
-    line_time: Annotated[float, Meta(ge=0.0, le=0.001)] = 0.0
-    """s from one row's exposure to the next one's; 0: all together."""
     time_offset: Annotated[float, Meta(ge=-2.0, le=2.0)] = 0.0
     """s, added to the stamps of its frames."""
     token: str = ""

@@ -15,9 +15,11 @@ import numpy as np
 
 from camera.calibration import Intrinsics, load_intrinsics
 from camera.capture import read_image
+from camera.dictionaries import DICTIONARIES, DictionaryError
 from camera.edges import SIGMA_UNREFINED_PX, warm_up
 from camera.fix import MarkerPose, marker_poses
-from camera.markers import DICTIONARIES, DictionaryError, MarkerDetector, MarkerSighting, Pixels, grey
+from camera.images import Pixels, grey
+from camera.markers import MarkerDetector, MarkerSighting
 from fusion.geometry import quaternion_from_rotation
 
 

@@ -8,11 +8,14 @@ drain, behind the very buffer that does not empty.)
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 
 # Seconds without any progress after which a client is cut off.
 STALL_LIMIT = 5.0
+
+# What a message is about, in words such as ("smooth", "rover", "json").
+Topic = tuple[str, ...]
 
 
 @dataclass(eq=False, slots=True)
@@ -23,17 +26,16 @@ class Subscription:
     write: Callable[[bytes], None]
     waiting: Callable[[], int]
     abort: Callable[[], None]
-    topics: frozenset[str]
+    topics: tuple[Topic, ...]
     interval: float
     room: int
     due: float = 0.0
     stalled_since: float | None = None
 
-    def is_due(self, now: float, early: bool = False) -> bool:
-        """Whether a message may go out. `early`: ahead of its time by up to one interval, to answer what just came;
-        the next one is then due as if it had been sent on time, so that the rate stays what it is."""
-        # A millisecond early is in time: a tick that is due at the same moment must not be missed by rounding.
-        return now >= self.due - (self.interval if early else 1e-3)
+    def is_due(self, now: float, early: float) -> bool:
+        """Whether a message may go out now, or so many s ahead of its time; the next one is then due as if it had
+        been sent on time, so that the rate stays what it is."""
+        return now >= self.due - early
 
     def sent(self, now: float) -> None:
         """A message has gone out."""
@@ -44,8 +46,9 @@ class Subscription:
 
 @dataclass
 class Hub:
-    """All clients. Time is an argument: s of one monotonic clock."""
+    """All clients. Time is an argument: s of one monotonic clock. `tick`: s between regular calls of `publish`."""
 
+    tick: float = 0.0
     subscriptions: list[Subscription] = field(default_factory=list)
     dropped: int = 0
     cut_off: int = 0
@@ -56,36 +59,41 @@ class Hub:
         write: Callable[[bytes], None],
         waiting: Callable[[], int],
         abort: Callable[[], None],
-        topics: Collection[str] = (),
+        topics: Collection[Topic] = (),
         rate_hz: float = 0.0,
         room: int = 0,
     ) -> Iterator[Subscription]:
         """`rate_hz` 0: every message. `room` 0: strictly the latest, nothing is added to what has not left yet."""
         interval = 1.0 / rate_hz if rate_hz > 0.0 else 0.0
-        subscription = Subscription(write, waiting, abort, frozenset(topics), interval, room)
+        subscription = Subscription(write, waiting, abort, tuple(dict.fromkeys(topics)), interval, room)
         self.subscriptions.append(subscription)
         try:
             yield subscription
         finally:
             self.subscriptions.remove(subscription)
 
-    def wants(self, topic: str) -> bool:
+    def wants(self, topic: Topic) -> bool:
         return any(topic in subscription.topics for subscription in self.subscriptions)
 
-    def due(self, now: float) -> set[str]:
-        """The topics of which somebody would get a message now."""
-        return set().union(*(client.topics for client in self.subscriptions if client.is_due(now)))
-
-    def publish(self, now: float, messages: Mapping[str, bytes]) -> None:
-        """`messages`: topic -> one encoded message. Those of one call count as one for the clients' rates."""
+    def publish(self, now: float, message: Callable[[Topic], bytes | None]) -> None:
+        """`message`: what there is of a topic, encoded. It is asked once for each that a client is due for; what a
+        client gets in one call counts as one for its rate."""
+        messages: dict[Topic, bytes | None] = {}
+        # At the nearest tick: one who wants every tick, and had to be due to the millisecond, would miss the next one
+        # after each that is late.
+        early = 0.5 * self.tick
         for subscription in self.subscriptions:
-            if subscription.is_due(now):
-                wanted = subscription.topics & messages.keys()
-                if wanted:
-                    self.send(now, subscription, *(messages[topic] for topic in messages if topic in wanted))
+            if not subscription.is_due(now, early):
+                continue
+            for topic in subscription.topics:
+                if topic not in messages:
+                    messages[topic] = message(topic)
+            wanted = [data for topic in subscription.topics if (data := messages[topic]) is not None]
+            if wanted:
+                self.send(now, subscription, *wanted)
 
     def send(self, now: float, subscription: Subscription, *messages: bytes) -> None:
-        """To one client that is due, perhaps early."""
+        """To one client that is due."""
         if subscription.waiting() > subscription.room:
             self.dropped += len(messages)
             return

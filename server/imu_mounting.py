@@ -141,12 +141,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if worst > POOR_DEG:
         print(f"steadfix: known to {worst:.1f} deg only; a longer drive with more curves tells more", file=sys.stderr)
-    print(json.dumps(_plain(found)) if args.json else _text(raw, found))
+    print(json.dumps(found._asdict(), default=np.ndarray.tolist) if args.json else _text(raw, found))
     return 0
-
-
-def _plain(found: Mounting) -> dict[str, object]:
-    return found._asdict() | {"sigma_deg": found.sigma_deg.tolist()}
 
 
 def _text(raw: Recording, found: Mounting) -> str:

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         if len(told) == len(SIDES):
             break
     found = solve_positions(_positions(np.concatenate(parts)))
-    print(json.dumps(_plain(found)) if args.json else _text(found))
+    print(json.dumps(found._asdict(), default=np.ndarray.tolist) if args.json else _text(found))
     return 0
 
 
@@ -52,10 +52,6 @@ def _positions(samples: Array) -> Array:
         return positions_seen(samples)
     except CalibrationError:
         return np.empty((0, 3))  # too few samples yet
-
-
-def _plain(found: Positions) -> dict[str, object]:
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found._asdict().items()}
 
 
 def _text(found: Positions) -> str:

@@ -42,12 +42,8 @@ def run(args: argparse.Namespace) -> int:
         if part[-1, 0] - parts[0][0, 0] > args.seconds + MARGIN:
             break
     rest = at_rest(np.concatenate(parts), args.seconds)
-    print(json.dumps(_plain(rest)) if args.json else _text(rest))
+    print(json.dumps(rest._asdict(), default=np.ndarray.tolist) if args.json else _text(rest))
     return 0
-
-
-def _plain(rest: Rest) -> dict[str, object]:
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in rest._asdict().items()}
 
 
 def _text(rest: Rest) -> str:

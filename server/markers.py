@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from camera.markers import DICTIONARIES, DictionaryError
+from camera.dictionaries import DICTIONARIES, DictionaryError
 from camera.printing import PAPERS, PrintError, print_markers
 
 

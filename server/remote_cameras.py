@@ -20,6 +20,7 @@ from websockets.asyncio.server import ServerConnection, broadcast
 from camera.calibration import CalibrationError
 from camera.exposure import Delivery
 from camera.markers import MarkerSighting
+from camera.settings import CaptureSettings
 from imu.clock import DeviceClock
 from server.camera_messages import (
     CameraHello,
@@ -135,13 +136,7 @@ class RemoteCamera(Camera):
             dictionary=config.dictionary,
             ids=sorted(self.ids),
             still=sorted(self.anchor_ids),
-            width_px=config.width_px,
-            height_px=config.height_px,
-            frame_rate_hz=config.frame_rate_hz,
-            pixel_format=config.pixel_format,
-            exposure_ms=config.exposure_ms,
-            gain=config.gain,
-            line_time=config.line_time,
+            **{name: getattr(config, name) for name in CaptureSettings.__struct_fields__},
         )
         questions = ClockQuestions()
         tending = None
@@ -160,7 +155,7 @@ class RemoteCamera(Camera):
                 tending.cancel()
             if self._connection is connection:
                 self._connection = None
-            if self._connection is None and not self._stop.is_set():
+            if self._connection is None and not self._thread.stopping.is_set():
                 # A frame may have come after what the node said last.
                 self._say(f"its node ({node}) has gone; waiting for it{self._trouble and f' ({self._trouble})'}")
 

@@ -24,10 +24,11 @@ from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import UNSET
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from imu.clock import Reading
+from server.connecting import FIRST_PAUSE, connect_to_service, longer
 from server.messages import (
     FORMATS,
     ClockAnswer,
@@ -46,10 +47,6 @@ from server.messages import (
 
 log = logging.getLogger("steadfix.robot")
 
-# s before connecting again: the first pause, which doubles up to the longest.
-FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
-# s between asking the service for a sign of life, and until a connection without one is given up.
-PING_INTERVAL, PING_TIMEOUT = 2.0, 3.0
 # s for which another connection of the robot's name is waited for at the start: longer than the service takes to see
 # that one has died, as after a robot that was switched off and on.
 TAKEN_FOR = 5.0
@@ -199,15 +196,7 @@ class Robot:
         while True:
             welcome = False
             try:
-                async with connect(
-                    self._url,
-                    ssl=tls,
-                    compression=None,
-                    max_size=1 << 16,
-                    ping_interval=PING_INTERVAL,
-                    ping_timeout=PING_TIMEOUT,
-                    proxy=None,
-                ) as connection:
+                async with connect_to_service(self._url, tls) as connection:
                     await self._send(self._hello, connection)
                     async for message in connection:
                         welcome |= await self._receive(connection, message, welcomed)
@@ -219,7 +208,7 @@ class Robot:
                 said = str(error)
             finally:
                 self._connection = None
-            pause = FIRST_PAUSE if welcome else min(2.0 * pause, LONGEST_PAUSE)
+            pause = FIRST_PAUSE if welcome else longer(pause)
             await asyncio.sleep(pause)
 
     async def _receive(self, connection: ClientConnection, data: str | bytes, welcomed: asyncio.Future[None]) -> bool:

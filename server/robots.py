@@ -87,7 +87,7 @@ class Robot:
             self._recording.imu(ImuBatch(self.config.name, now, readings))
         batch = ImuBatch(self.config.name, now, self._to_body(readings))
         self.stream.feed(raw, batch.samples, arrival)
-        track = np.full((len(raw), 8), np.nan)
+        track = np.empty((len(raw), 8))
         self.vitals.judged(self.localiser.feed(batch, track))
         self.vitals.sampled(batch.samples, track)
         if self._recording is not None:

@@ -26,6 +26,7 @@ DOORS = {
         "server/listening.py",
         "server/calibration_page.py",
         "server/app.py",
+        "server/connecting.py",
         "server/robot_client.py",
         "server/remote_cameras.py",
         "server/camera_node.py",

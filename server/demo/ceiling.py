@@ -20,7 +20,7 @@ import numpy as np
 
 from camera.calibration import load_intrinsics
 from camera.capture import Frame, FrameSource
-from camera.markers import Image
+from camera.images import Image
 from camera.synthetic import Room, straight_down
 from fusion.geometry import exp_so3, rotation_about_z, transform
 from fusion.measurements import Array

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from camera.alignment import Alignment
-from camera.markers import dictionary_by_name
+from camera.dictionaries import dictionary_by_name
 from camera.synthetic import Room
 from fusion.geometry import rotation_about_z, transform
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA

@@ -9,6 +9,7 @@ import pytest
 
 from camera import capture
 from camera.capture import FileSource, Frame, LiveSource, V4l2Device, open_source, read_image, without_password
+from camera.settings import CaptureSettings
 from tests.camera.rtsp import NetworkCamera
 
 WAIT = 20.0
@@ -75,7 +76,7 @@ def test_a_folder_comes_by_name_and_leaves_out_what_is_no_image(tmp_path, caplog
     (tmp_path / "b.png").write_bytes((tmp_path / "c.png").read_bytes()[:40])
     (tmp_path / "notes.txt").write_text("not an image")
     with caplog.at_level(logging.WARNING):
-        frames = numbers(open_source(str(tmp_path), frame_rate_hz=5.0, paced=False))
+        frames = numbers(open_source(str(tmp_path), CaptureSettings(frame_rate_hz=5.0), paced=False))
     assert [round(frame.image.mean() / 10) for frame in frames] == [1, 3, 4]
     np.testing.assert_allclose(np.diff([frame.t for frame in frames]), 0.2, atol=1e-9)
     assert "b.png: not an image that can be read; skipped" in caplog.text
@@ -243,7 +244,12 @@ def test_a_usb_camera_is_set_up_and_stamps_mid_exposure(monkeypatch, caplog):
     caplog.set_level(logging.INFO)
     webcam = Webcam()
     monkeypatch.setattr(cv2, "VideoCapture", webcam)
-    camera = V4l2Device(0, 640, 480, 30.0, "MJPG", exposure=0.004, gain=20.0)
+    camera = V4l2Device(
+        0,
+        CaptureSettings(
+            width_px=640, height_px=480, frame_rate_hz=30.0, pixel_format="MJPG", exposure_ms=4.0, gain=20.0
+        ),
+    )
     assert webcam.set_in_order == [
         cv2.CAP_PROP_FOURCC,
         cv2.CAP_PROP_FRAME_WIDTH,
@@ -270,7 +276,7 @@ def test_a_usb_camera_is_set_up_and_stamps_mid_exposure(monkeypatch, caplog):
 
 def test_a_usb_camera_that_does_not_take_its_exposure_says_so(monkeypatch, caplog):
     monkeypatch.setattr(cv2, "VideoCapture", Webcam(age=1000.0, refuses=(cv2.CAP_PROP_EXPOSURE,)))
-    camera = V4l2Device(0, exposure=0.004)
+    camera = V4l2Device(0, CaptureSettings(exposure_ms=4.0))
     (record,) = caplog.records
     assert record.getMessage() == "camera 0: exposure_ms = 4 was asked for, it says 15.7"
     begin = time.monotonic()

@@ -100,6 +100,7 @@ def test_a_placement_comes_back_exactly_as_it_was_written(tmp_path):
     np.testing.assert_array_equal(read.world_from_camera, written.world_from_camera)
     np.testing.assert_array_equal(read.covariance, written.covariance)
     assert (read.rms_px, read.anchors_seen) == (written.rms_px, written.anchors_seen)
+    assert read.calibration == INTRINSICS.fingerprint
 
 
 @pytest.mark.parametrize(

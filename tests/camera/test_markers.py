@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from camera.capture import read_image
+from camera.dictionaries import DICTIONARIES, DictionaryError, dictionary_by_name
 from camera.edges import refine_corners
-from camera.markers import DICTIONARIES, DictionaryError, MarkerDetector, dictionary_by_name, grey
+from camera.images import grey
+from camera.markers import MarkerDetector
 from camera.synthetic import Room
 from fusion.geometry import exp_so3, rotation_about_z, transform
 from tests.camera.scene import INTRINSICS, WORLD_FROM_CAMERA

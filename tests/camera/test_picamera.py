@@ -9,6 +9,7 @@ import pytest
 
 from camera.capture import open_source
 from camera.picamera import EXPOSURE, GAIN, TIMEOUT, PiCamera, y_plane
+from camera.settings import CaptureSettings
 
 
 @pytest.mark.skipif(importlib.util.find_spec("picamera2") is not None, reason="picamera2 is installed here")
@@ -98,9 +99,10 @@ def pi(monkeypatch):
 
 def test_exposure_and_gain_are_fixed_and_stamps_are_mid_exposure(pi, caplog):
     caplog.set_level(logging.INFO)
-    source = open_source(
-        "picamera", width_px=641, height_px=480, frame_rate_hz=30.0, exposure=0.002, gain=8.0, line_time=19e-6
+    settings = CaptureSettings(
+        width_px=641, height_px=480, frame_rate_hz=30.0, exposure_ms=2.0, gain=8.0, line_time=19e-6
     )
+    source = open_source("picamera", settings)
     frame = source.read(10.0)
     source.close()
     camera = pi.latest
@@ -131,7 +133,7 @@ def test_an_exposure_that_is_not_granted_and_a_stamp_of_no_clock_are_said_once(p
     caplog.set_level(logging.INFO)
     monkeypatch.setattr(pi, "exposure", 0.01)
     monkeypatch.setattr(pi, "age", -1000.0)
-    camera = PiCamera(exposure=0.05)
+    camera = PiCamera(CaptureSettings(exposure_ms=50.0))
     begin = time.monotonic()
     frames = [camera.grab() for _ in range(3)]
     assert begin - 0.005 <= frames[0].t <= time.monotonic() - 0.005

@@ -6,7 +6,8 @@ import pypdfium2
 import pytest
 
 from camera.boards import BoardDetector, parse_board
-from camera.markers import DictionaryError, MarkerDetector
+from camera.dictionaries import DictionaryError
+from camera.markers import MarkerDetector
 from camera.printing import PAPERS, PrintError, print_board, print_markers
 
 DPI = 300

@@ -14,6 +14,7 @@ from fusion.geometry import (
     quaternion_from_rotation,
     rotation_about_z,
     rotation_from_quaternion,
+    rotation_vectors,
     skew,
     transform,
     transform_points,
@@ -30,6 +31,14 @@ def test_exp_is_a_rotation(v):
     R = exp_so3(v)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert math.isclose(np.linalg.det(R), 1.0, abs_tol=1e-12)
+
+
+@given(vectors, vectors)
+def test_rotations_between_quaternions_are_the_logs_between_rotations(a, b):
+    quaternions = [np.array([quaternion_from_rotation(exp_so3(v))]) for v in (a, b)]
+    (between,) = rotation_vectors(*quaternions)
+    assert np.linalg.norm(between) <= math.pi + 1e-9
+    np.testing.assert_allclose(exp_so3(between), exp_so3(a).T @ exp_so3(b), atol=1e-9)
 
 
 @given(vectors)

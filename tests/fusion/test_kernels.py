@@ -32,25 +32,26 @@ def some_covariance(rng):
     return A @ A.T + 1e-4 * np.eye(k.N)
 
 
-def moved(s, dx):
-    """The state whose error from s is dx, from the definition of the error."""
+def moved(s, dx, fix=False):
+    """The state whose error from s is dx, from the definition of the error; that by a fix counts δv δt_d in."""
     out = s.copy()
     R = rotation_from_quaternion(s[k.Q : k.Q + 4])
     out[k.Q : k.Q + 4] = quaternion_from_rotation(R @ exp_so3(dx[k.TH : k.TH + 3]))
     out[k.V : k.V + 3] += R @ dx[k.DV : k.DV + 3]
-    out[k.POS : k.POS + 3] += R @ dx[k.DP : k.DP + 3]
+    out[k.POS : k.POS + 3] += R @ (dx[k.DP : k.DP + 3] - fix * dx[k.DV : k.DV + 3] * dx[k.DTD])
     out[k.BG : k.COV] += dx[k.DBG :]
     return out
 
 
-def error(s, other):
+def error(s, other, fix=False):
     """The error (N,) that leads from s to other."""
     R = rotation_from_quaternion(s[k.Q : k.Q + 4])
+    faster = R.T @ (other[k.V : k.V + 3] - s[k.V : k.V + 3])
     return np.concatenate(
         [
             log_so3(R.T @ rotation_from_quaternion(other[k.Q : k.Q + 4])),
-            R.T @ (other[k.V : k.V + 3] - s[k.V : k.V + 3]),
-            R.T @ (other[k.POS : k.POS + 3] - s[k.POS : k.POS + 3]),
+            faster,
+            R.T @ (other[k.POS : k.POS + 3] - s[k.POS : k.POS + 3]) + fix * faster * (other[k.TD] - s[k.TD]),
             other[k.BG : k.COV] - s[k.BG : k.COV],
         ]
     )
@@ -58,7 +59,8 @@ def error(s, other):
 
 def predict(s, dt, noise=(0.0, 0.0, 0.0, 0.0)):
     out = s.copy()
-    k.predict(out[: k.BLOCK], *INPUT, dt, *noise)
+    k.predict(out[: k.BLOCK], *INPUT, dt, *noise[:2])
+    k.spread(out[: k.BLOCK], *noise[2:])
     return out
 
 
@@ -109,6 +111,28 @@ def test_process_noise_is_that_of_integrated_white_noise():
     np.testing.assert_allclose(np.diag(P)[k.DBG : k.DBG + 3], gyro_walk**2, rtol=1e-9)
     np.testing.assert_allclose(np.diag(P)[k.DBA : k.DBA + 3], accel_walk**2, rtol=1e-9)
     assert np.trace(P[k.DP : k.DP + 3, k.DP : k.DP + 3]) > accel**2  # 3 axes × 1/3
+
+
+def test_the_covariance_of_several_samples_at_once_is_that_of_each_to_second_order():
+    """As far as the whole step turns: half a step, a quarter of what is left out."""
+    rng = np.random.default_rng(4)
+    s = some_state(rng)
+    s[k.COV : k.COV + k.N * k.N] = some_covariance(rng).ravel()
+    inputs = INPUT * rng.uniform(0.5, 1.5, (4, 6))
+    left_out = []
+    for dt in (0.005, 0.0025):
+        each, once = s.copy(), s.copy()
+        for u in inputs:
+            for out in (each, once):
+                k.predict(out[: k.BLOCK], *u, dt, 1e-2, 3e-2)
+            k.spread(each[: k.BLOCK], 1e-3, 4e-3)
+        k.spread(once[: k.BLOCK], 1e-3, 4e-3)
+        np.testing.assert_array_equal(once[: k.COV], each[: k.COV])
+        assert once[k.LAG] == once[k.ANGLE_VARIANCE] == once[k.VELOCITY_VARIANCE] == 0.0
+        P, Q = (state[k.COV : k.COV + k.N * k.N] for state in (once, each))
+        left_out.append(np.abs(P - Q).max() / np.abs(Q).max())
+    assert left_out[0] / left_out[1] == pytest.approx(4.0, rel=0.2)
+    assert left_out[0] < 2e-3
 
 
 def fix_model(s, z):
@@ -267,14 +291,15 @@ def slowed(s, dt, noise, steps=1):
         R = rotation_from_quaternion(out[k.Q : k.Q + 4])
         up = np.array([*out[k.TILT : k.TILT + 2], np.sqrt(1.0 - np.sum(out[k.TILT : k.TILT + 2] ** 2))])
         gyro, accel = out[k.BG : k.BG + 3], out[k.BA : k.BA + 3] + GRAVITY * R.T @ up
-        k.predict(out[: k.BLOCK], *gyro, *accel, dt / steps, 0.0, 0.0, 0.0, 0.0)
+        k.predict(out[: k.BLOCK], *gyro, *accel, dt / steps, 0.0, 0.0)
+        k.spread(out[: k.BLOCK], 0.0, 0.0)
         k._slow(out[: k.BLOCK], dt / steps, noise)
     return out
 
 
 def test_a_speed_decays_the_same_in_one_step_or_many():
     s = some_state(np.random.default_rng(9))
-    # A covariance without what the attitude and biases would add, which predict knows of a step at a time.
+    # A covariance without what the attitude and biases would add, which spread knows of a step at a time.
     P = np.zeros((k.N, k.N))
     A = np.random.default_rng(10).normal(0.0, 0.1, (6, 6))
     P[3:9, 3:9] = A @ A.T
@@ -306,25 +331,27 @@ def test_a_bridged_speed_scatters_as_the_process_simulated_step_by_step():
     assert s[k.V] == pytest.approx(velocity.mean(), abs=0.02)
 
 
-def test_update_is_the_textbook_one_and_keeps_a_covariance():
+@pytest.mark.parametrize("fix", [False, True])
+def test_update_is_the_textbook_one_and_keeps_a_covariance(fix):
     rng = np.random.default_rng(5)
     s = some_state(rng)
     P = some_covariance(rng)
     s[k.COV : k.COV + k.N * k.N] = P.ravel()
     H, y = rng.normal(0.0, 1.0, (4, k.N)), rng.normal(0.0, 0.05, 4)
+    H[:, k.DTD] *= fix
     R = np.diag([0.1, 0.2, 0.3, 0.4])
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     dx = K @ y
     before = s.copy()
     assert k.update(s[: k.BLOCK], H, y, R)
-    np.testing.assert_allclose(error(before, s), dx, atol=1e-12)
+    np.testing.assert_allclose(error(before, s, fix), dx, atol=1e-12)
     # the error about the new state, by differences of its definition
     J = np.empty((k.N, k.N))
     h = 1e-6
     for i in range(k.N):
         e = np.zeros(k.N)
         e[i] = h
-        J[:, i] = (error(s, moved(before, dx + e)) - error(s, moved(before, dx - e))) / (2.0 * h)
+        J[:, i] = (error(s, moved(before, dx + e, fix)) - error(s, moved(before, dx - e, fix))) / (2.0 * h)
     after = s[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)
     np.testing.assert_allclose(after, J @ (P - K @ H @ P) @ J.T, atol=1e-8)
     np.testing.assert_array_equal(after, after.T)

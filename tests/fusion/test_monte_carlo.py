@@ -106,10 +106,8 @@ def test_it_is_as_good_as_it_says(motion, flips, capsys):
     report = monte_carlo(motion, flips)
     show(capsys, f"{motion} with flips" if flips else motion, report)
     assert 0.93 < report.anees < 1.07
-    # Attitude: a little above the 1.05 that is asked for. One drive of the hundred with flips starts in free flight so
-    # wrongly that it is seconds before it finds back.
-    assert report.position < (2.0 if flips and motion == "free" else 1.05)
-    assert report.attitude < 1.08
+    assert report.position < 1.05
+    assert report.attitude < 1.05
     assert report.worst < (2.0 if flips else 0.4)
 
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fusion.consistency import rms
-from fusion.measurements import Array, Outcome, PoseHypothesis
-from fusion.params import FilterParams, Motion
+from fusion.consistency import nees, rms
+from fusion.measurements import Array, Outcome, PoseFix, PoseHypothesis
+from fusion.params import GRAVITY, FilterParams, Motion
 from fusion.simulator import (
     CameraParams,
     ImuParams,
@@ -114,6 +114,45 @@ def test_a_flipped_first_fix_is_seen_by_gravity():
     """The less likely pose has 13 more in misfit, and is upright; the other leans by 57 degrees."""
     simulation = simulate(random_ground(3), 3, 60.0, camera=CameraParams(two_poses=True, flip=0.4))
     assert drive(simulation).mm() < held_mm(simulation)
+
+
+def test_of_two_first_poses_the_one_that_takes_over_is_as_if_it_had_been_alone():
+    """Before the first fix there is no IMU to tell them apart, and the wrong one has less misfit."""
+    simulation = simulate(aggressive(1), 1, 3.0, camera=CameraParams(two_poses=True))
+    first, second = sorted(simulation.fixes, key=lambda fix: fix.t)[:2]
+    between = (simulation.samples[:, 0] > first.t) & (simulation.samples[:, 0] < second.t + 0.01)
+    simulation = replace(simulation, samples=simulation.samples[between], arrival=simulation.arrival[between])
+    right, wrong = first.hypotheses
+    right = replace(right, misfit=wrong.misfit + 1.0)
+    # neither learns from what the other one had wrong
+    params = FilterParams(adaptation=0.0, still_speed=0.0)
+    alone, taken_over = (
+        drive(replace(simulation, fixes=[replace(first, hypotheses=poses), second]), params, "free").localiser.latest
+        for poses in ((right,), (wrong, right))
+    )
+    assert alone is not None
+    assert taken_over is not None
+    np.testing.assert_allclose(taken_over.position, alone.position, atol=1e-4)
+    np.testing.assert_allclose(taken_over.covariance, alone.covariance, rtol=0.01, atol=1e-8)
+
+
+@pytest.mark.parametrize("late", [-0.05, 0.05])
+def test_the_start_knows_what_an_unknown_offset_of_the_stamps_does_to_it(late):
+    """Found at 1.6 m/s and 1 rad/s, with stamps that are wrong by one sigma; nothing else is."""
+    t = np.arange(0.0, 4.0, 0.005)
+    zero = np.zeros_like(t)
+    shaken = 1e-3 * np.random.default_rng(1).standard_normal((len(t), 6))  # no sensor repeats itself
+    samples = np.column_stack([t, shaken + [0.0, 0.0, 1.0, 0.0, 0.0, GRAVITY]])
+    truth = np.column_stack([t, 1.6 * t, zero, zero, np.cos(0.5 * t), zero, zero, np.sin(0.5 * t)])
+    covariance = np.diag([0.005**2] * 3 + [0.0175**2] * 3)
+    fixes = [
+        PoseFix("robot", row[0] + late, row[0] + 0.2, (PoseHypothesis(row[1:4], row[4:], covariance),))
+        for row in truth[100::100]
+    ]
+    still = np.zeros((len(t), 3))
+    run = drive(Simulation(samples, t, fixes, truth, still, still, still, np.empty((0, 3))), None, "free")
+    assert len(run.errors) == 6
+    assert nees(run.errors, run.covariances).max() < 6.0
 
 
 @pytest.mark.parametrize("motion", ["free", "ground"])

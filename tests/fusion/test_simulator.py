@@ -56,7 +56,7 @@ def integrate(simulation: Simulation) -> tuple[float, float]:
     state[k.TILT : k.TILT + 2] = TILT
     samples = simulation.samples
     for u, dt in zip(0.5 * (samples[:-1] + samples[1:]), np.diff(samples[:, 0]), strict=True):
-        k.predict(state[: k.BLOCK], *u[1:], dt, 0.0, 0.0, 0.0, 0.0)
+        k.predict(state[: k.BLOCK], *u[1:], dt, 0.0, 0.0)
     last = simulation.truth[-1]
     angle = attitude_angle(state[np.newaxis, k.Q : k.Q + 4], last[np.newaxis, 4:])
     return float(np.linalg.norm(state[k.POS : k.POS + 3] - last[1:4])), float(angle[0])

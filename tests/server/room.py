@@ -11,7 +11,7 @@ import subprocess
 import time
 import urllib.error
 import urllib.request
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,10 @@ from websockets.asyncio.client import ClientConnection, connect
 
 from camera.calibration import Intrinsics
 from camera.capture import Frame
+from camera.images import Image
 from camera.synthetic import Room, straight_down
-from fusion.geometry import rotation_about_z, transform
-from fusion.measurements import PoseFix, PoseHypothesis
+from fusion.geometry import exp_so3, inverse, rotation_about_z, transform
+from fusion.measurements import Array, PoseFix, PoseHypothesis
 from server.app import Service
 from server.config import CameraConfig, Config, parse
 
@@ -73,6 +74,18 @@ async def serving(config: str | Config = CONFIG, **arguments: Any) -> AsyncItera
     async with Service(parse(config) if isinstance(config, str) else config, **arguments) as service:
         await service.ready.wait()
         yield service
+
+
+@contextlib.asynccontextmanager
+async def beside(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    """Work that goes on meanwhile."""
+    task = asyncio.create_task(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
 
 
 def client(service: Service, path: str) -> connect:
@@ -150,14 +163,10 @@ class Ceiling:
     """A frame source: a rendered room with the rover at a fixed place, a frame whenever one is asked for."""
 
     WORLD_FROM_CAMERA = straight_down(0.0, 0.0, 2.5)
-    # The marker lies on the robot's origin, 0.1 m up.
     WORLD_FROM_BODY = transform(rotation_about_z(0.5), [0.3, 0.2, 0.0])
 
     def __init__(self, config: CameraConfig, frames: float = math.inf) -> None:
-        marker = self.WORLD_FROM_BODY @ transform(np.eye(3), [0.0, 0.0, 0.1])
-        anchors = {40: transform(np.eye(3), [0.6, -0.6, 0.0]), 41: transform(np.eye(3), [-0.6, 0.6, 0.0])}
-        room = Room(INTRINSICS, self.WORLD_FROM_CAMERA, "4X4_50", 1)
-        self._image = room.render({7: (0.14, marker, marker)} | {id: (0.18, at, at) for id, at in anchors.items()})
+        self._image = picture()
         self._left = frames
         self._sequence = 0
 
@@ -170,3 +179,25 @@ class Ceiling:
 
     def close(self) -> None:
         pass
+
+
+ANCHORS = {40: (0.6, -0.6, 0.0), 41: (-0.6, 0.6, 0.0)}
+# The marker lies on the robot's origin, 0.1 m up.
+BODY_FROM_MARKER = transform(np.eye(3), [0.0, 0.0, 0.1])
+
+
+def picture(
+    world_from_body: Array = Ceiling.WORLD_FROM_BODY,
+    *,
+    body_from_marker: Array = BODY_FROM_MARKER,
+    moved: float = 0.0,
+    shake: Sequence[float] = (0.0, 0.0, 0.0),
+    anchors: Mapping[int, Sequence[float]] = ANCHORS,
+) -> Image:
+    """What the camera sees, turned by `shake` about its own axes, rad, of the rover, which moves by `moved`, m."""
+    half, marker = transform(np.eye(3), [0.5 * moved, 0.0, 0.0]), world_from_body @ body_from_marker
+    places = {id: transform(np.eye(3), place) for id, place in anchors.items()}
+    room = Room(INTRINSICS, Ceiling.WORLD_FROM_CAMERA @ transform(exp_so3(shake), np.zeros(3)), "4X4_50", 1)
+    return room.render(
+        {7: (0.14, inverse(half) @ marker, half @ marker)} | {id: (0.18, at, at) for id, at in places.items()}
+    )

@@ -24,10 +24,13 @@ from playwright.async_api import Page, async_playwright
 from camera.boards import parse_board
 from camera.calibration import load_intrinsics
 from camera.capture import Frame
-from server import calibrate, cli
+from camera.settings import CaptureSettings
+from fusion.measurements import Array
+from server import calibrate
 from server.calibration_page import CalibrationPage
 from tests.camera.board_views import CAMERA, Studio, good_poses
 from tests.data import data
+from tests.server.command import steadfix
 from tests.server.room import run
 from tests.server.test_page import CHROMIUM, FLAGS, see
 
@@ -40,28 +43,23 @@ def studio() -> Studio:
     return Studio(parse_board(BOARD))
 
 
+def enough(studio: Studio) -> list[Array]:
+    """28 poses of the board that are accepted."""
+    return good_poses(studio) + [studio.held((x, y), 0.33) for x in (0.1, 0.9) for y in (0.1, 0.9)]
+
+
 @pytest.fixture(scope="module")
 def pictures(studio: Studio, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with 28 pictures that are enough."""
+    """A folder with pictures that are enough."""
     folder = tmp_path_factory.mktemp("pictures")
-    poses = good_poses(studio)
-    poses += [studio.held((x, y), 0.33) for x in (0.1, 0.9) for y in (0.1, 0.9)]
-    for k, pose in enumerate(poses):
+    for k, pose in enumerate(enough(studio)):
         cv2.imwrite(str(folder / f"{k:02}.png"), studio.picture(pose))
     return folder
 
 
-def steadfix(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Exit status, output and standard error."""
-    status = cli.main(["calibrate", *map(str, arguments)])
-    output = capfd.readouterr()
-    assert "Traceback" not in output.err
-    return status, output.out, output.err
-
-
 def test_pictures_that_are_enough(capfd: pytest.CaptureFixture[str], pictures: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.toml"
-    status, text, err = steadfix(capfd, pictures, "--out", out)
+    status, text, err = steadfix(capfd, "calibrate", pictures, "--out", out)
     assert status == 0
     assert err.splitlines() == [
         "steadfix calibrate: the board is in 28 of 28 pictures",
@@ -77,7 +75,7 @@ def test_photographs(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     folder = data("chessboard_photos")
     out = tmp_path / "camera.toml"
     arguments = (*sorted(folder.glob("*.jpg")), "--board", "chessboard:9x6:25mm", "--out", out, "--json")
-    status, text, err = steadfix(capfd, *arguments)
+    status, text, err = steadfix(capfd, "calibrate", *arguments)
     content = json.loads(text)
     assert (status, content["accepted"], content["written"]) == (1, False, None)
     assert content["rms_px"] <= 0.20
@@ -85,7 +83,7 @@ def test_photographs(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert {c["name"] for c in content["criteria"] if not c["met"]} == {"views", "coverage", "corners", "projection"}
     assert not out.exists()
     assert f"{out} is not written: what is missing" in err
-    status, text, err = steadfix(capfd, *arguments, "--force")
+    status, text, err = steadfix(capfd, "calibrate", *arguments, "--force")
     assert (status, json.loads(text)["written"]) == (0, str(out))
     assert "because of --force" in err
     assert "accepted = false" in out.read_text()
@@ -95,7 +93,7 @@ def test_eight_frontal_pictures_are_refused(capfd: pytest.CaptureFixture[str], s
     for k in range(8):
         pose = studio.held((0.3 + 0.13 * (k % 4), 0.4 + 0.2 * (k // 4)), 0.45)
         cv2.imwrite(str(tmp_path / f"{k}.png"), studio.picture(pose))
-    status, text, err = steadfix(capfd, tmp_path, "--out", tmp_path / "camera.toml")
+    status, text, err = steadfix(capfd, "calibrate", tmp_path, "--out", tmp_path / "camera.toml")
     assert status == 1
     assert "MISSING  8 views of the board: take 12 more" in text
     assert "MISSING  0 views tilted by 20 to 45 deg: tilt the board by about 30 deg" in text
@@ -111,8 +109,8 @@ def test_pictures_that_are_none_are_named_and_the_others_used(
     deep = 257 * studio.picture(good_poses(studio)[0]).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "deep.png"), np.dstack([deep] * 4))
     status, _, err = steadfix(
-        capfd, pictures, pictures / "03.png", tmp_path / "text.png", tmp_path / "black.png", tmp_path / "gone.png",
-        tmp_path / "deep.png", "--out", tmp_path / "camera.toml",
+        capfd, "calibrate", pictures, pictures / "03.png", tmp_path / "text.png", tmp_path / "black.png",
+        tmp_path / "gone.png", tmp_path / "deep.png", "--out", tmp_path / "camera.toml",
     )  # fmt: skip
     # The calibration is good and written; that a picture could not be read is still to be seen from the status.
     assert status == 1
@@ -134,10 +132,12 @@ def test_another_image_size_and_another_board(
     large = cv2.resize(cv2.imread(str(pictures / "05.png")), None, fx=2.0, fy=2.0)
     cv2.imwrite(str(tmp_path / "large.png"), large)
     out = tmp_path / "camera.toml"
-    status, text, err = steadfix(capfd, pictures, tmp_path / "large.png", "--out", out)
+    status, text, err = steadfix(capfd, "calibrate", pictures, tmp_path / "large.png", "--out", out)
     assert (status, text) == (1, "")
     assert "large.png is 1280 x 960 px, 00.png 640 x 480 px: all pictures must come from one camera" in err
-    status, text, err = steadfix(capfd, pictures / "00.png", "--board", "charuco:8x6:30mm:21mm:4X4_50", "--out", out)
+    status, text, err = steadfix(
+        capfd, "calibrate", pictures / "00.png", "--board", "charuco:8x6:30mm:21mm:4X4_50", "--out", out
+    )
     assert (status, text) == (1, "")
     assert "it shows markers of 5X5_250" in err
     assert "too few views of the board: 0, and at least 4 are needed" in err
@@ -154,9 +154,8 @@ def test_arguments_that_cannot_be_followed(capfd: pytest.CaptureFixture[str], pi
         ((pictures, "--board", "9x6", *out), 2, "'9x6' is no board; chessboard:9x6:25mm"),
         (("--source", tmp_path / "none.mp4", *out), 1, "none.mp4: no such video file, folder of images or camera"),
     ):
-        assert steadfix(capfd, *arguments)[0] == status, arguments
-        assert cli.main(["calibrate", *map(str, arguments)]) == status
-        err = capfd.readouterr().err
+        found, _, err = steadfix(capfd, "calibrate", *arguments)
+        assert found == status, arguments
         assert says in err
         assert err.count("\n") == 1
 
@@ -165,9 +164,7 @@ def test_arguments_that_cannot_be_followed(capfd: pytest.CaptureFixture[str], pi
 def film(studio: Studio, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as a camera: each place of the board for two pictures."""
     folder = tmp_path_factory.mktemp("film")
-    poses = good_poses(studio)
-    poses += [studio.held((x, y), 0.33) for x in (0.1, 0.9) for y in (0.1, 0.9)]
-    for k, pose in enumerate(poses):
+    for k, pose in enumerate(enough(studio)):
         for n in range(2):
             cv2.imwrite(str(folder / f"{k:02}-{n}.png"), studio.picture(pose))
     return folder
@@ -177,7 +174,7 @@ def test_a_guided_calibration_ends_when_it_is_good(
     capfd: pytest.CaptureFixture[str], film: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "camera.toml"
-    status, text, err = steadfix(capfd, "--source", film, "--out", out, "--port", 0)
+    status, text, err = steadfix(capfd, "calibrate", "--source", film, "--out", out, "--port", 0)
     assert status == 0
     lines = [line.removeprefix("steadfix calibrate: ") for line in err.splitlines()]
     assert re.match(r"http://127\.0\.0\.1:\d+/ shows the picture", lines[0])
@@ -192,7 +189,9 @@ def test_a_guided_calibration_ends_when_it_is_good(
 def test_a_source_that_ends_too_early_is_judged(capfd: pytest.CaptureFixture[str], film: Path, tmp_path: Path) -> None:
     for path in sorted(film.iterdir())[:12]:
         (tmp_path / path.name).symlink_to(path)
-    status, text, err = steadfix(capfd, "--source", tmp_path, "--out", tmp_path / "camera.toml", "--port", 0, "--json")
+    status, text, err = steadfix(
+        capfd, "calibrate", "--source", tmp_path, "--out", tmp_path / "camera.toml", "--port", 0, "--json"
+    )
     assert status == 1
     assert "the source has ended" in err
     assert json.loads(text)["written"] is None
@@ -207,8 +206,8 @@ class Wobbly:
         self._pictures = pictures
         self._read = 0
 
-    def open(self, source: str, **wishes: int) -> Wobbly:
-        assert wishes == {"width_px": 640, "height_px": 0}
+    def open(self, source: str, settings: CaptureSettings) -> Wobbly:
+        assert settings == CaptureSettings(width_px=640)
         self.opened += 1
         if self.opened == 2:
             raise FileNotFoundError("camera 0: not there")

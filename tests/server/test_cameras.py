@@ -13,59 +13,12 @@ import pytest
 
 from camera.calibration import save_intrinsics
 from camera.capture import Frame
-from camera.markers import Pixels
-from camera.synthetic import Room, straight_down
+from camera.images import Pixels
 from fusion.geometry import exp_so3, quaternion_from_rotation, rotation_about_z, transform
 from fusion.measurements import Array, Mode, Pose, PoseFix
 from server.cameras import PLACEMENT_FRAMES, Camera, Seen
-from server.config import Config, parse
-from tests.server.room import INTRINSICS
-
-WORLD_FROM_CAMERA = straight_down(0.0, 0.0, 2.5)
-WORLD_FROM_BODY = transform(rotation_about_z(0.5), [0.3, 0.2, 0.0])
-CONFIG = """
-[[camera]]
-name = "ceiling"
-source = "frames"
-calibration = "camera.toml"
-{camera}
-[[anchor]]
-id = 40
-size_mm = 180
-position_m = [0.6, -0.6, 0.0]
-[[anchor]]
-id = 41
-size_mm = 180
-position_m = [-0.6, 0.6, 0.0]
-[[anchor]]
-id = 42
-size_mm = 180
-position_m = [-0.7, -0.6, 0.0]
-[[robot]]
-name = "rover"
-[[robot.marker]]
-id = 7
-size_mm = 140
-position_m = [0.0, 0.0, 0.1]
-{marker}
-"""
-ANCHORS = {40: [0.6, -0.6, 0.0], 41: [-0.6, 0.6, 0.0], 42: [-0.7, -0.6, 0.0]}
-UP = transform(np.eye(3), [0.0, 0.0, 0.1])
-
-
-def picture(
-    world_from_body: Array = WORLD_FROM_BODY,
-    *,
-    shake: Iterable[float] = (0.0, 0.0, 0.0),
-    body_from_marker: Array = UP,
-    moved: float = 0.0,
-) -> Pixels:
-    """What a camera sees that is turned by `shake` about its own axes, rad, of a robot that moves by `moved`, m."""
-    at = {id: (0.18, pose, pose) for id, pose in ((id, transform(np.eye(3), place)) for id, place in ANCHORS.items())}
-    half = transform(np.eye(3), [0.5 * moved, 0.0, 0.0])
-    at[7] = (0.14, np.linalg.inv(half) @ world_from_body @ body_from_marker, half @ world_from_body @ body_from_marker)
-    room = Room(INTRINSICS, WORLD_FROM_CAMERA @ transform(exp_so3(list(shake)), np.zeros(3)), "4X4_50", 1)
-    return room.render(at, noise=1.0)
+from server.config import parse
+from tests.server.room import ANCHORS, CAMERA, CONFIG, INTRINSICS, Ceiling, picture
 
 
 class Frames:
@@ -92,11 +45,13 @@ def watch(tmp_path: Path) -> Callable[..., tuple[Camera, list[list[PoseFix]]]]:
         *,
         camera: str = "",
         marker: str = "",
+        more: str = "",
         line_time: float = 0.0,
         poses_at: Callable[[float], Mapping[str, Pose]] = lambda t: {},
     ) -> tuple[Camera, list[list[PoseFix]]]:
         save_intrinsics(tmp_path / "camera.toml", INTRINSICS)
-        config: Config = parse(CONFIG.format(camera=camera, marker=marker), folder=tmp_path)
+        robots = CONFIG.replace("position_m = [0.0, 0.0, 0.1]", f"position_m = [0.0, 0.0, 0.1]\n{marker}")
+        config = parse(robots + CAMERA.replace("[[camera]]", f"[[camera]]\n{camera}") + more, folder=tmp_path)
         fixes: list[list[PoseFix]] = []
 
         def deliver(seen: Seen) -> None:
@@ -113,7 +68,7 @@ def watch(tmp_path: Path) -> Callable[..., tuple[Camera, list[list[PoseFix]]]]:
     return run
 
 
-def distance(fix: PoseFix, world_from_body: Array = WORLD_FROM_BODY) -> float:
+def distance(fix: PoseFix, world_from_body: Array = Ceiling.WORLD_FROM_BODY) -> float:
     return float(np.linalg.norm(fix.hypotheses[0].position - world_from_body[:3, 3]))
 
 
@@ -124,21 +79,21 @@ def test_a_shaken_camera_sends_the_fixes_of_one_at_rest(watch):
     # 8 mrad would be 20 mm on the floor.
     assert [distance(fix) < 0.003 for (fix,) in fixes[PLACEMENT_FRAMES:]] == [True] * 3
     assert camera.placement is not None
-    np.testing.assert_allclose(camera.placement.world_from_camera[:3, 3], WORLD_FROM_CAMERA[:3, 3], atol=0.005)
+    np.testing.assert_allclose(camera.placement.world_from_camera[:3, 3], Ceiling.WORLD_FROM_CAMERA[:3, 3], atol=0.005)
 
 
-def test_an_anchor_that_was_pushed_is_no_shake(watch, monkeypatch):
-    before = picture()
-    monkeypatch.setitem(ANCHORS, 42, [-0.67, -0.6, 0.0])
-    _, fixes = watch([before] * PLACEMENT_FRAMES + [picture()] * 2)
+def test_an_anchor_that_was_pushed_is_no_shake(watch):
+    before, after = (picture(anchors={**ANCHORS, 42: (x, -0.6, 0.0)}) for x in (-0.7, -0.67))
+    third = "[[anchor]]\nid = 42\nsize_mm = 180\nposition_m = [-0.7, -0.6, 0.0]"
+    _, fixes = watch([before] * PLACEMENT_FRAMES + [after] * 2, more=third)
     assert [distance(fix) < 0.002 for (fix,) in fixes[PLACEMENT_FRAMES:]] == [True] * 2
 
 
 def test_each_marker_is_stamped_by_its_own_row(watch):
     line_time = 20e-6
     _, fixes = watch([picture()] * 2, line_time=line_time, camera="time_offset = -0.01")
-    camera_from_world = np.linalg.inv(WORLD_FROM_CAMERA)
-    point = INTRINSICS.camera_matrix @ (camera_from_world @ WORLD_FROM_BODY @ [0.0, 0.0, 0.1, 1.0])[:3]
+    camera_from_world = np.linalg.inv(Ceiling.WORLD_FROM_CAMERA)
+    point = INTRINSICS.camera_matrix @ (camera_from_world @ Ceiling.WORLD_FROM_BODY @ [0.0, 0.0, 0.1, 1.0])[:3]
     row = point[1] / point[2]
     assert fixes[0][0].t == pytest.approx(100.0 - 0.01 + line_time * row, abs=1e-6)
 

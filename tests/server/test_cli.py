@@ -111,7 +111,17 @@ def test_a_closed_pipe() -> None:
     assert answer.stderr == ""
 
 
-@pytest.mark.parametrize(("arguments", "absent"), [("detect", "fusion.kernels"), ("--version", "numpy")])
+@pytest.mark.parametrize(
+    ("arguments", "absent"),
+    [
+        ("detect", "fusion.kernels"),
+        ("camera", "fusion.kernels"),
+        ("markers", "numba"),
+        ("board", "numba"),
+        ("calibrate", "numba"),
+        ("--version", "numpy"),
+    ],
+)
 def test_what_a_command_does_not_need_is_not_imported(arguments: str, absent: str) -> None:
     script = (
         "import sys, server.cli\n"

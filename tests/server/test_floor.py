@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,9 +17,10 @@ from camera.calibration import Intrinsics, save_intrinsics
 from camera.floor import Placement, load_placement, save_placement
 from camera.synthetic import Room, straight_down
 from fusion.geometry import exp_so3, rotation_about_z, transform
-from server import cli
 from server.cameras import PLACEMENT_FRAMES, Camera
-from server.config import parse
+from server.config import load, parse
+from server.remote_cameras import RemoteCamera
+from tests.server.command import steadfix
 from tests.server.room import CONFIG, INTRINSICS, Ceiling, run, serving, until
 
 CAMERA = Intrinsics(
@@ -58,19 +61,8 @@ def write(folder: Path, places: Places = PLACES, more: str = "") -> None:
     (folder / "room.toml").write_text("\n".join(lines) + "\n")
 
 
-def steadfix(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Exit status, output and standard error."""
-    try:
-        status = cli.main(["floor", *map(str, arguments)])
-    except SystemExit as usage:
-        status = int(usage.code or 0)
-    output = capfd.readouterr()
-    assert "Traceback" not in output.err
-    return status, output.out, output.err
-
-
 def test_a_live_camera_is_located_and_the_error_told(capfd: pytest.CaptureFixture[str], folder: Path) -> None:
-    status, text, err = steadfix(capfd, folder / "room.toml")
+    status, text, err = steadfix(capfd, "floor", folder / "room.toml")
     assert status == 0
     written = folder / "ceiling-placement.toml"
     assert err.splitlines() == [
@@ -94,7 +86,9 @@ def test_a_live_camera_is_located_and_the_error_told(capfd: pytest.CaptureFixtur
 
 def test_pictures_and_json(capfd: pytest.CaptureFixture[str], folder: Path) -> None:
     out = folder / "there.toml"
-    status, text, _ = steadfix(capfd, folder / "room.toml", folder / "frames" / "0.png", "--out", out, "--json")
+    status, text, _ = steadfix(
+        capfd, "floor", folder / "room.toml", folder / "frames" / "0.png", "--out", out, "--json"
+    )
     assert status == 0
     content = json.loads(text)
     camera = content["cameras"]["ceiling"]
@@ -113,19 +107,19 @@ def test_pictures_and_json(capfd: pytest.CaptureFixture[str], folder: Path) -> N
 
 
 def test_one_anchor_is_a_quick_start_that_says_what_it_is(capfd: pytest.CaptureFixture[str], folder: Path) -> None:
-    _, text, _ = steadfix(capfd, folder / "room.toml", "--json")
+    _, text, _ = steadfix(capfd, "floor", folder / "room.toml", "--json")
     four = max(error for *_, error in json.loads(text)["cameras"]["ceiling"]["floor_mm"])
     write(folder, {40: PLACES[40]})
-    status, text, _ = steadfix(capfd, folder / "room.toml", "--json")
+    status, text, _ = steadfix(capfd, "floor", folder / "room.toml", "--json")
     assert status == 0
     assert max(error for *_, error in json.loads(text)["cameras"]["ceiling"]["floor_mm"]) > 3.0 * four
-    assert "a quick start" in steadfix(capfd, folder / "room.toml")[1]
+    assert "a quick start" in steadfix(capfd, "floor", folder / "room.toml")[1]
 
 
 def test_tapes_alone(capfd: pytest.CaptureFixture[str], folder: Path) -> None:
     write(folder, dict.fromkeys(PLACES, (0.0, 0.0, 0.0)))
     tapes = ["--tape", "40-41:2100mm", "--tape", "41-42:1.5m", "--tape", "42-43:210cm", "--tape", "40-43:1502mm"]
-    status, text, err = steadfix(capfd, folder / "room.toml", *tapes)
+    status, text, err = steadfix(capfd, "floor", folder / "room.toml", *tapes)
     assert status == 0
     assert "put the [[anchor]] sections above into" in err
     assert re.search(r"^tape 40-43: 1502 mm measured, 150[012]\.\d mm found$", text, re.MULTILINE)
@@ -138,7 +132,7 @@ def test_tapes_alone(capfd: pytest.CaptureFixture[str], folder: Path) -> None:
     assert places[1].yaw_deg == pytest.approx(np.degrees(0.9), abs=0.3)
     by_tapes = load_placement(folder / "ceiling-placement.toml").world_from_camera
     write(folder, {a.id: (*a.position_m[:2], np.radians(a.yaw_deg)) for a in places})
-    assert steadfix(capfd, folder / "room.toml")[0] == 0
+    assert steadfix(capfd, "floor", folder / "room.toml")[0] == 0
     surveyed = load_placement(folder / "ceiling-placement.toml").world_from_camera
     np.testing.assert_allclose(surveyed, by_tapes, atol=3e-3)
 
@@ -164,7 +158,7 @@ def test_what_contradicts_is_named(
 ) -> None:
     write(folder, {**PLACES, **change})
     arguments = [argument for tape in tapes for argument in ("--tape", tape)]
-    status, text, err = steadfix(capfd, folder / "room.toml", *arguments)
+    status, text, err = steadfix(capfd, "floor", folder / "room.toml", *arguments)
     assert says in err
     doubted = says.startswith("DOUBT")
     assert status == (0 if doubted else 2)
@@ -190,7 +184,7 @@ def test_bad_input(capfd: pytest.CaptureFixture[str], folder: Path, picture: np.
         ((folder / "none.toml",), 1, "none.toml: no such file"),
         ((folder,), 1, "is a directory"),
     ):
-        found, text, err = steadfix(capfd, *arguments)
+        found, text, err = steadfix(capfd, "floor", *arguments)
         assert says in err
         assert (found, text) == (status, "")
     assert list(folder.glob("*placement*")) == []
@@ -203,7 +197,7 @@ def test_a_marker_that_is_there_twice_is_named(capfd: pytest.CaptureFixture[str]
     other = room.render({41: (0.15, at[43], at[43])})
     image[:, :480] = other[:, :480]
     cv2.imwrite(str(folder / "twice.png"), image)
-    status, _, err = steadfix(capfd, folder / "room.toml", folder / "twice.png")
+    status, _, err = steadfix(capfd, "floor", folder / "room.toml", folder / "twice.png")
     assert status == 2
     assert re.search(
         r"marker 41 is in the picture 2 times, at \d+, \d+ px and \d+, \d+ px: two sheets with one id", err
@@ -221,13 +215,14 @@ def test_the_service_uses_what_was_written_where_no_anchor_is_in_view(
     (tmp_path / "room.toml").write_text(camera + anchors)
     config = parse(camera + anchors, folder=tmp_path)
     cv2.imwrite(str(tmp_path / "seen.png"), Ceiling(config.camera[0]).read(1.0).image)  # type: ignore[union-attr]
-    assert steadfix(capfd, tmp_path / "room.toml", tmp_path / "seen.png")[0] == 0
+    assert steadfix(capfd, "floor", tmp_path / "room.toml", tmp_path / "seen.png")[0] == 0
 
     async def main() -> None:
         # No [[anchor]] at all: only the file says where the camera hangs.
         placed = camera + 'placement = "ceiling-placement.toml"\n'
         async with serving(parse(CONFIG + placed, folder=tmp_path), open_camera=Ceiling) as service:
             assert service.cameras["ceiling"].unlocated == ""
+            assert service.cameras["ceiling"].advice(0.0) == {}
             await until(
                 lambda: service.robots["rover"].localiser.pose_at(service.cameras["ceiling"].last_frame) is not None
             )
@@ -236,6 +231,33 @@ def test_the_service_uses_what_was_written_where_no_anchor_is_in_view(
             np.testing.assert_allclose(pose.position[:2], Ceiling.WORLD_FROM_BODY[:2, 3], atol=0.03)
 
     run(main)
+
+
+@pytest.mark.parametrize(("source", "kind"), [("frames", Camera), ("remote", RemoteCamera)])
+def test_a_placement_of_another_calibration_is_said_until_it_is_found_again(
+    capfd: pytest.CaptureFixture[str], folder: Path, source: str, kind: type[Camera]
+) -> None:
+    picture = folder / "frames" / "0.png"
+    write(folder, more='placement = "there.toml"\n')
+    config = folder / "room.toml"
+
+    def said() -> dict[str, str]:
+        room = load(config)
+        return kind(msgspec.structs.replace(room.camera[0], source=source), room, lambda seen: None).advice(0.0)
+
+    assert steadfix(capfd, "floor", config, picture)[0] == 0
+    assert said() == {}
+    # Only the file of the calibration is written anew: its lens is what it was.
+    save_intrinsics(folder / "camera.toml", replace(CAMERA, rms_px=0.2))
+    assert said() == {}
+    save_intrinsics(
+        folder / "camera.toml", replace(CAMERA, camera_matrix=CAMERA.camera_matrix * [[1.01], [1.0], [1.0]])
+    )
+    (text,) = said().values()
+    assert f"there.toml was found with another calibration than {folder / 'camera.toml'}" in text
+    assert "run `steadfix floor` again" in text
+    assert steadfix(capfd, "floor", config, picture)[0] == 0
+    assert said() == {}
 
 
 def test_a_placement_is_kept_while_the_anchors_in_view_agree(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from playwright.async_api import Page, async_playwright
 from camera.calibration import save_intrinsics
 from server.app import Service
 from server.config import parse
-from tests.server.room import CAMERA, CONFIG, INTRINSICS, Ceiling, client, fix, hello, imu, run, serving, until
+from tests.server.room import CAMERA, CONFIG, INTRINSICS, Ceiling, beside, client, fix, hello, imu, run, serving, until
 
 CHROMIUM = Path("/usr/bin/chromium")
 # Without the last four it looks for Google's hosts at every start.
@@ -54,13 +54,8 @@ async def driving(service: Service, robot: str = "rover") -> AsyncIterator[None]
                 await connection.send(imu(time.monotonic()))
                 await asyncio.sleep(0.05)  # the pace of this robot
 
-    task = asyncio.create_task(send())
-    try:
+    async with beside(send()):
         yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
 
 
 async def see(page: Page, expression: str) -> None:

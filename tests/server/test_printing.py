@@ -6,18 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from server import cli
-
-
-def steadfix(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Exit status, output and standard error."""
-    try:
-        status = cli.main([str(argument) for argument in arguments])
-    except SystemExit as usage:
-        status = int(usage.code or 0)
-    output = capfd.readouterr()
-    assert "Traceback" not in output.err
-    return status, output.out, output.err
+from tests.server.command import steadfix
 
 
 def test_sheets_are_written_where_they_are_wanted(

@@ -30,7 +30,7 @@ from server.app import Service
 from server.camera_messages import CameraWelcome, encode
 from server.camera_node import Node, NodeError
 from server.config import Config, parse
-from tests.server.room import CAMERA, CONFIG, INTRINSICS, Ceiling, client, health, heard, run, serving, until
+from tests.server.room import CAMERA, CONFIG, INTRINSICS, Ceiling, beside, client, health, heard, run, serving, until
 
 IDS = [7, 8, 40, 41]
 
@@ -305,7 +305,7 @@ class Moving:
         self.due.release()
 
 
-WELCOME = CameraWelcome("ceiling", "test", "4X4_50", [7], [], 0, 0, 0.0, "", 0.0, 0.0, 0.0)
+WELCOME = CameraWelcome("ceiling", "test", "4X4_50", [7], [])
 
 
 @contextlib.asynccontextmanager
@@ -337,15 +337,13 @@ def test_where_the_link_stalls_the_newest_frame_replaces_the_one_that_waits() ->
 
         async with listening(service) as url:
             node = Node(url, "ceiling", lambda welcome: source)
-            work = asyncio.create_task(node.run())
-            while node.dropped < 1000:
+            async with beside(node.run()):
+                while node.dropped < 1000:
+                    source.due.release()
+                    await asyncio.sleep(0)
+                resume.set()
+                await done.wait()
                 source.due.release()
-                await asyncio.sleep(0)
-            resume.set()
-            await done.wait()
-            source.due.release()
-            work.cancel()
-            await asyncio.wait((work,))
         # What was replaced never came; what came last is the newest.
         assert sequences == sorted(sequences)
         assert len(sequences) <= source.read_ones - node.dropped
@@ -368,13 +366,10 @@ def test_a_node_connects_again_and_opens_its_camera_only_once() -> None:
             opened.append(Moving())
             return opened[-1]
 
-        async with listening(service) as url:
-            work = asyncio.create_task(Node(url, "ceiling", open_).run())
+        async with listening(service) as url, beside(Node(url, "ceiling", open_).run()):
             for _ in range(3):
                 (await connections.get()).transport.abort()
             await connections.get()
-            work.cancel()
-            await asyncio.wait((work,))
         assert len(opened) == 1
         assert opened[0].closed
 
@@ -408,15 +403,12 @@ def test_a_camera_that_is_pulled_out_is_opened_again() -> None:
                 source.due.release()
             return source
 
-        async with listening(service) as url:
-            work = asyncio.create_task(Node(url, "ceiling", open_).run())
+        async with listening(service) as url, beside(Node(url, "ceiling", open_).run()):
             troubles = [None]
             while opened < 3 or troubles[-1] != "":
                 message = await told.get()
                 if message["type"] == "status" and message["trouble"] != troubles[-1]:
                     troubles.append(message["trouble"])
-            work.cancel()
-            await asyncio.wait((work,))
         assert opened == 3
         assert set(troubles[1:]) <= {
             "the camera is being opened",

@@ -19,6 +19,7 @@ from server.app import Service
 from server.config import Config, parse
 from server.messages import PoseMessage
 from server.robot_client import RefusedError, Robot
+from tests.server.room import beside
 
 TIMEOUT = 100.0
 CONFIG = parse("""
@@ -59,12 +60,8 @@ async def at_rest(service: Service, robot: Robot) -> AsyncIterator[None]:
                 service.robots["rover"].feed_fix(PoseFix("rover", now - 0.05, now, (pose,)), now)
             await asyncio.sleep(0.05)
 
-    task = asyncio.create_task(work())
-    try:
+    async with beside(work()):
         yield
-    finally:
-        task.cancel()
-        await asyncio.wait((task,))
 
 
 async def poses(robot: Robot, count: int) -> list[PoseMessage]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from fusion.geometry import rotation_about_z, transform
 from fusion.measurements import Mode, Pose
-from server.hub import STALL_LIMIT, Hub
+from server.hub import STALL_LIMIT, Hub, Topic
 from server.messages import (
     Clock,
     ClockAnswer,
@@ -198,10 +199,17 @@ def test_bearings_are_from_0_to_below_360(angle: float, bearing: float) -> None:
     assert message["bearing"] == pytest.approx(bearing)
 
 
+A, B, C = ("a",), ("b",), ("c",)
+
+
+def about(**messages: bytes) -> Callable[[Topic], bytes | None]:
+    return lambda topic: messages.get(topic[0])
+
+
 class Client:
     """A client's buffer, taken from or not."""
 
-    def __init__(self, hub: Hub, *topics: str, rate_hz: float = 0.0, room: int = 0) -> None:
+    def __init__(self, hub: Hub, *topics: Topic, rate_hz: float = 0.0, room: int = 0) -> None:
         self.received: list[bytes] = []
         self.waiting = 0
         self.aborted = False
@@ -218,72 +226,92 @@ class Client:
 
 def test_each_client_gets_its_topics() -> None:
     hub = Hub()
-    a, b = Client(hub, "a"), Client(hub, "a", "b")
-    assert hub.due(1.0) == {"a", "b"}
-    assert hub.wants("b")
-    assert not hub.wants("c")
-    hub.publish(1.0, {"a": b"A", "b": b"B"})
+    a, b, nothing = Client(hub, A), Client(hub, A, B, A), Client(hub, C)
+    asked: list[Topic] = []
+
+    def message(topic: Topic) -> bytes | None:
+        asked.append(topic)
+        return None if topic == C else topic[0].upper().encode()
+
+    hub.publish(1.0, message)
     assert a.received == [b"A"]
     assert b.received == [b"A", b"B"]
+    assert nothing.received == []
+    # Each is encoded once, whoever gets it.
+    assert asked == [A, B, C]
+    assert hub.wants(B)
     b.subscribed.__exit__(None, None, None)
-    assert not hub.wants("b")
+    assert not hub.wants(B)
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 20.0, 25.0, 37.0, 50.0, 100.0])
 def test_a_client_gets_its_own_rate(rate_hz: float) -> None:
-    hub = Hub()
-    client = Client(hub, "a", rate_hz=rate_hz)
+    hub = Hub(tick=0.02)
+    client = Client(hub, A, rate_hz=rate_hz)
     rng = np.random.default_rng(3)
     for i in range(500):
-        hub.publish(100.0 + i * 0.02 + rng.uniform(0.0, 0.004), {"a": b"A"})
+        hub.publish(100.0 + i * 0.02 + rng.uniform(0.0, 0.004), about(a=b"A"))
     assert len(client.received) == pytest.approx(10.0 * min(rate_hz, 50.0), abs=2)
 
 
+def test_ticks_that_are_late_now_and_then_cost_nobody_a_message() -> None:
+    hub = Hub(tick=0.02)
+    # Due at any time between two ticks.
+    clients = [Client(hub, A, rate_hz=50.0) for _ in range(20)]
+    for i, client in enumerate(clients):
+        client.subscription.due = 100.0 + 1e-3 * i
+    rng = np.random.default_rng(4)
+    for i in range(500):
+        late = rng.uniform(0.0, 2e-4) + (rng.uniform(0.0, 0.008) if rng.random() < 0.1 else 0.0)
+        hub.publish(100.0 + i * 0.02 + late, about(a=b"A"))
+    assert min(len(client.received) for client in clients) >= 499
+
+
 def test_an_early_answer_does_not_change_the_rate() -> None:
-    hub = Hub()
-    client = Client(hub, "a", rate_hz=50.0)
+    hub = Hub(tick=0.01)
+    client = Client(hub, A, rate_hz=50.0)
     # 20 batches a second, each answered at once; the tick of 100 Hz sends what is due in between.
     answered = 0
     for i in range(1, 10_001):
         now = 100.0 + i * 1e-3
         if i % 50 == 17:
-            assert client.subscription.is_due(now, early=True)
+            assert client.subscription.is_due(now, early=client.subscription.interval)
             hub.send(now, client.subscription, b"early")
             assert client.received[-1] == b"early"
             answered += 1
         if i % 10 == 0:
-            hub.publish(now, {"a": b"A"})
+            hub.publish(now, about(a=b"A"))
     assert answered == 200
     assert len(client.received) == pytest.approx(500, abs=2)
 
 
 def test_more_batches_than_poses_are_not_all_answered() -> None:
     hub = Hub()
-    client = Client(hub, "a", rate_hz=20.0)
+    client = Client(hub, A, rate_hz=20.0)
     for i in range(2000):
         now = 100.0 + i * 0.005
-        if client.subscription.is_due(now, early=True):
+        if client.subscription.is_due(now, early=client.subscription.interval):
             hub.send(now, client.subscription, b"early")
     assert len(client.received) == pytest.approx(200, abs=2)
 
 
 def test_after_a_pause_nothing_is_caught_up() -> None:
-    hub = Hub()
-    client = Client(hub, "a", rate_hz=10.0)
-    hub.publish(0.0, {"a": b"A"})
+    hub = Hub(tick=0.01)
+    client = Client(hub, A, rate_hz=10.0)
+    hub.publish(0.0, about(a=b"A"))
     for i in range(10):
-        hub.publish(60.0 + i * 0.01, {"a": b"A"})
+        hub.publish(60.0 + i * 0.01, about(a=b"A"))
     assert len(client.received) == 2
 
 
 def test_a_slow_client_gets_the_latest_and_holds_nobody_up() -> None:
     hub = Hub()
-    slow, fast = Client(hub, "a"), Client(hub, "a")
+    slow, fast = Client(hub, A), Client(hub, A)
     slow.waiting = 1
     for i in range(10):
-        hub.publish(i * 0.02, {"a": str(i).encode()})
+        hub.publish(i * 0.02, about(a=str(i).encode()))
     slow.waiting = 0
-    hub.publish(0.2, {"a": b"10"})
+    hub.publish(0.2, about(a=b"10"))
     assert slow.received == [b"10"]
     assert len(fast.received) == 11
     assert hub.dropped == 10
@@ -291,7 +319,7 @@ def test_a_slow_client_gets_the_latest_and_holds_nobody_up() -> None:
 
 def test_a_client_that_takes_nothing_is_cut_off() -> None:
     hub = Hub()
-    stalled, slow = Client(hub, "a"), Client(hub, "a")
+    stalled, slow = Client(hub, A), Client(hub, A)
     stalled.waiting = slow.waiting = 1
     hub.sweep(0.0)
     slow.waiting = 0
