@@ -108,7 +108,7 @@ def test_it_is_as_good_as_it_says(motion, flips, capsys):
     assert 0.93 < report.anees < 1.07
     assert report.position < 1.05
     assert report.attitude < 1.05
-    assert report.worst < (2.0 if flips else 0.4)
+    assert report.worst < (1.0 if flips else 0.4)
 
 
 @pytest.mark.long
