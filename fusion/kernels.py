@@ -1301,93 +1301,95 @@ def _settle(s, prm):
 
 @_jit
 def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
-    """Carry the state to t_end, on its way to the next sample, and take all that is due until then at its instant."""
-    while True:
-        cursor = int(s[FIX_CURSOR])
-        t = t_end
-        due = NOTHING
-        if cursor < fix_end:
-            t_fix = fixes[cursor & FIX_MASK, F_T] + s[TD_APPLIED]
-            if t_fix <= t_end:
-                t, due = t_fix, A_FIX
-        wheel = int(s[WHEEL_CURSOR])
-        if wheel < wheel_end and wheels[wheel & WHEEL_MASK, 0] <= t:
-            t, due = wheels[wheel & WHEEL_MASK, 0], A_READING
-        # An offset that has just shrunk can put a fix before the one before it, by its change: it is taken now.
-        dt = t - s[T]
-        if s[BRIDGING] > 0.0:
-            # after longer than that nothing is known any less
-            dt = min(dt, MOST_BRIDGED)
-        if dt > 0.0:
-            # the input at t, on the line from the state's to the next sample's; its mean on the way there
-            part = 1.0
-            if t < s[NEXT_T] and math.isfinite(s[T]):
-                part = dt / (s[NEXT_T] - s[T])
-            if s[INITIALISED] > 0.0:
-                gx = s[U] + 0.5 * part * (s[NEXT_U] - s[U])
-                gy = s[U + 1] + 0.5 * part * (s[NEXT_U + 1] - s[U + 1])
-                gz = s[U + 2] + 0.5 * part * (s[NEXT_U + 2] - s[U + 2])
-                ax = s[U + 3] + 0.5 * part * (s[NEXT_U + 3] - s[U + 3])
-                ay = s[U + 4] + 0.5 * part * (s[NEXT_U + 4] - s[U + 4])
-                az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
-                rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
-                # An accelerometer that shakes three times as much as its noise says has more of it.
-                shaken2 = s[CHANGE_ACCEL] / 6.0 * min(s[NEXT_T] - s[T_IMU], prm[IMU_GAP])
-                if shaken2 > 9.0 * prm[ACCEL_NOISE] * prm[ACCEL_NOISE]:
-                    force_noise = max(force_noise, math.sqrt(shaken2) - 2.0 * prm[ACCEL_NOISE])
-                if s[BLIND] > 0.0:
-                    # anything up to several times what it has ever said
-                    rate_noise, force_noise = s[LARGEST_GYRO] * BLIND_TIME, s[LARGEST_ACCEL] * BLIND_TIME
-                for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-                    if s[BRIDGING] > 0.0:
-                        # Straight on: the input that says so is the bias, and gravity seen from the body.
-                        c0, c1 = s[o + TILT], s[o + TILT + 1]
-                        c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
-                        w, x, y, z = s[o], s[o + 1], s[o + 2], s[o + 3]
-                        gx, gy, gz = s[o + BG], s[o + BG + 1], s[o + BG + 2]
-                        turns = t - s[T_WHEEL] <= prm[IMU_GAP]
-                        if turns:
-                            gz += s[WHEEL_RATE]
-                        ax = (1.0 - 2.0 * (y * y + z * z)) * c0 + 2.0 * ((x * y + w * z) * c1 + (x * z - w * y) * c2)
-                        ay = (1.0 - 2.0 * (x * x + z * z)) * c1 + 2.0 * ((x * y - w * z) * c0 + (y * z + w * x) * c2)
-                        az = (1.0 - 2.0 * (x * x + y * y)) * c2 + 2.0 * ((x * z + w * y) * c0 + (y * z - w * x) * c1)
-                        ax = GRAVITY * ax + s[o + BA]
-                        ay = GRAVITY * ay + s[o + BA + 1]
-                        az = GRAVITY * az + s[o + BA + 2]
-                        rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
-                        if turns:
-                            rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
-                    predict(s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt, rate_noise, force_noise)
-                    if s[BRIDGING] > 0.0:
-                        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
-                        _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
-            if part == 1.0:
-                for i in range(6):
-                    s[U + i] = s[NEXT_U + i]
-            else:
-                for i in range(6):
-                    s[U + i] += part * (s[NEXT_U + i] - s[U + i])
-            s[T] = t
-        if due != NOTHING or s[LAG] > LONGEST_LAG or math.floor(t * GRID_HZ) != s[GRID_AT]:
-            _settle(s, prm)
-        if due == NOTHING:
-            return
-        if due == A_READING:
-            if s[INITIALISED] > 0.0:
-                _odometry(s, prm, wheels[wheel & WHEEL_MASK])
-            s[WHEEL_CURSOR] = wheel + 1
+    """Carry the state to t_end, on its way to the next sample, or to what is due before. -> what that is."""
+    cursor = int(s[FIX_CURSOR])
+    t = t_end
+    due = NOTHING
+    if cursor < fix_end:
+        t_fix = fixes[cursor & FIX_MASK, F_T] + s[TD_APPLIED]
+        if t_fix <= t_end:
+            t, due = t_fix, A_FIX
+    wheel = int(s[WHEEL_CURSOR])
+    if wheel < wheel_end and wheels[wheel & WHEEL_MASK, 0] <= t:
+        t, due = wheels[wheel & WHEEL_MASK, 0], A_READING
+    # An offset that has just shrunk can put a fix before the one before it, by its change: it is taken now.
+    dt = t - s[T]
+    if s[BRIDGING] > 0.0:
+        # after longer than that nothing is known any less
+        dt = min(dt, MOST_BRIDGED)
+    if dt > 0.0:
+        # the input at t, on the line from the state's to the next sample's; its mean on the way there
+        part = 1.0
+        if t < s[NEXT_T] and math.isfinite(s[T]):
+            part = dt / (s[NEXT_T] - s[T])
+        if s[INITIALISED] > 0.0:
+            gx = s[U] + 0.5 * part * (s[NEXT_U] - s[U])
+            gy = s[U + 1] + 0.5 * part * (s[NEXT_U + 1] - s[U + 1])
+            gz = s[U + 2] + 0.5 * part * (s[NEXT_U + 2] - s[U + 2])
+            ax = s[U + 3] + 0.5 * part * (s[NEXT_U + 3] - s[U + 3])
+            ay = s[U + 4] + 0.5 * part * (s[NEXT_U + 4] - s[U + 4])
+            az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
+            rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
+            # An accelerometer that shakes three times as much as its noise says has more of it.
+            shaken2 = s[CHANGE_ACCEL] / 6.0 * min(s[NEXT_T] - s[T_IMU], prm[IMU_GAP])
+            if shaken2 > 9.0 * prm[ACCEL_NOISE] * prm[ACCEL_NOISE]:
+                force_noise = max(force_noise, math.sqrt(shaken2) - 2.0 * prm[ACCEL_NOISE])
+            if s[BLIND] > 0.0:
+                # anything up to several times what it has ever said
+                rate_noise, force_noise = s[LARGEST_GYRO] * BLIND_TIME, s[LARGEST_ACCEL] * BLIND_TIME
+            for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
+                if s[BRIDGING] > 0.0:
+                    # Straight on: the input that says so is the bias, and gravity seen from the body.
+                    c0, c1 = s[o + TILT], s[o + TILT + 1]
+                    c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
+                    w, x, y, z = s[o], s[o + 1], s[o + 2], s[o + 3]
+                    gx, gy, gz = s[o + BG], s[o + BG + 1], s[o + BG + 2]
+                    turns = t - s[T_WHEEL] <= prm[IMU_GAP]
+                    if turns:
+                        gz += s[WHEEL_RATE]
+                    ax = (1.0 - 2.0 * (y * y + z * z)) * c0 + 2.0 * ((x * y + w * z) * c1 + (x * z - w * y) * c2)
+                    ay = (1.0 - 2.0 * (x * x + z * z)) * c1 + 2.0 * ((x * y - w * z) * c0 + (y * z + w * x) * c2)
+                    az = (1.0 - 2.0 * (x * x + y * y)) * c2 + 2.0 * ((x * z + w * y) * c0 + (y * z - w * x) * c1)
+                    ax = GRAVITY * ax + s[o + BA]
+                    ay = GRAVITY * ay + s[o + BA + 1]
+                    az = GRAVITY * az + s[o + BA + 2]
+                    rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
+                    if turns:
+                        rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
+                predict(s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt, rate_noise, force_noise)
+                if s[BRIDGING] > 0.0:
+                    spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
+                    _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
+        if part == 1.0:
+            for i in range(6):
+                s[U + i] = s[NEXT_U + i]
         else:
-            fix = fixes[cursor & FIX_MASK]
-            if s[INITIALISED] > 0.0:
-                _judge(s, prm, fix)
-            else:
-                _initialise(s, prm, fix)
-                fix[F_OUTCOME] = INIT
-            s[TD_APPLIED] = s[TD]
-            s[FIX_CURSOR] = cursor + 1
-        if s[BRIDGING] > 0.0:
-            # no sample may come to do it
-            _grid(s, prm)
+            for i in range(6):
+                s[U + i] += part * (s[NEXT_U + i] - s[U + i])
+        s[T] = t
+    if due != NOTHING or s[LAG] > LONGEST_LAG or math.floor(t * GRID_HZ) != s[GRID_AT]:
+        _settle(s, prm)
+    return due
+
+
+@_jit
+def _take(s, prm, fixes, wheels, due):
+    """The fix or the reading that is due at T."""
+    if due == A_READING:
+        number = int(s[WHEEL_CURSOR])
+        if s[INITIALISED] > 0.0:
+            _odometry(s, prm, wheels[number & WHEEL_MASK])
+        s[WHEEL_CURSOR] = number + 1
+    else:
+        number = int(s[FIX_CURSOR])
+        fix = fixes[number & FIX_MASK]
+        if s[INITIALISED] > 0.0:
+            _judge(s, prm, fix)
+        else:
+            _initialise(s, prm, fix)
+            fix[F_OUTCOME] = INIT
+        s[TD_APPLIED] = s[TD]
+        s[FIX_CURSOR] = number + 1
 
 
 @_jit
@@ -1446,7 +1448,14 @@ def _advance(s, prm, imu, fixes, fix_end, wheels, wheel_end, checkpoints, meta, 
             _fill(s[NEXT_U : NEXT_U + 6], s[U:])
         else:
             break
-        _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t)
+        while True:
+            due = _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t)
+            if due == NOTHING:
+                break
+            _take(s, prm, fixes, wheels, due)
+            if s[BRIDGING] > 0.0:
+                # no sample may come to do it
+                _grid(s, prm)
         s[TRAILING] = trailing
         if sample and t == imu[row, 0]:
             if s[INITIALISED] > 0.0:
