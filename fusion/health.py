@@ -40,22 +40,20 @@ _KEEP = 4096  # rows that stay when a ring is full: the filter's own ring holds 
 
 
 class _Poses:
-    """Poses that were given out, and the last fix in each."""
+    """Poses that were given out, and the last fix in each: rows of t, position, quaternion wxyz, instant of the fix."""
 
     def __init__(self) -> None:
         self._rows = np.empty((2 * _KEEP, 9))
         self._instants = self._rows[:, 0]
         self._end = 0
 
-    def add(self, poses: Array, last_fix: float) -> None:
-        """Rows (n, 8) of t, position, quaternion wxyz, n <= _KEEP."""
-        n = len(poses)
+    def next(self, n: int) -> Array:
+        """(n, 9), to be filled with as many more; n <= _KEEP."""
         if self._end + n > len(self._rows):
             self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
             self._end = _KEEP
-        rows = self._rows[self._end : self._end + n]
-        rows[:, :8], rows[:, 8] = poses, last_fix
         self._end += n
+        return self._rows[self._end - n : self._end]
 
     def at(self, t: float, longest: float) -> tuple[Array, float] | None:
         """The pose (7,) for instant t and the last fix in it; None if there was none, in a gap longer than that, s."""
@@ -114,7 +112,8 @@ class Health:
                 self._end = _KEEP
             self._rows[self._end : self._end + n] = samples[at : at + _KEEP]
             self._end += n
-            self._given[0].add(track[at : at + _KEEP], self._last_fix)
+            given = self._given[0].next(n)
+            given[:, :8], given[:, 8] = track[at : at + _KEEP], self._last_fix
         self._last_fix = self.localiser.last_fix
 
     def wheels(self, odometry: WheelOdometry) -> None:
@@ -125,8 +124,8 @@ class Health:
 
     def published(self, pose: Pose) -> None:
         """A pose that was given out, later than the one before."""
-        row = np.concatenate([[pose.t], pose.position, pose.quaternion_wxyz])
-        self._given[1].add(row[np.newaxis], pose.t - pose.fix_age)
+        row = self._given[1].next(1)[0]
+        row[0], row[1:4], row[4:8], row[8] = pose.t, pose.position, pose.quaternion_wxyz, pose.t - pose.fix_age
 
     def another_imu(self) -> None:
         """The device has connected anew, or it is another one: what the last one sent is no measure for it."""

@@ -271,9 +271,8 @@ class DeviceClock:
 
     def _choose(self) -> None:
         """The question that was the quickest on its way there."""
-        self._best = min(
-            self._questions, key=lambda q: self._line(q.received) - q.sent - AGEING * q.received, default=None
-        )
+        slope = 1.0 + self.skew - AGEING
+        self._best = min(self._questions, key=lambda q: slope * q.received - q.sent, default=None)
 
 
 def _hull_slope(points: Sequence[tuple[float, float]]) -> float:

@@ -83,8 +83,8 @@ TRACKER_ROOM = 64 * 1024
 SILENCE = 3.0
 # s until a robot must have said who it is.
 HELLO_TIMEOUT = 10.0
-# s between two diagnoses of each robot: one takes some milliseconds.
-DIAGNOSE_EVERY = 5.0
+# s between two rounds of diagnoses; and their share of the loop's time within one, since each takes some milliseconds.
+DIAGNOSE_EVERY, DIAGNOSE_SHARE = 5.0, 0.05
 # s that a camera waits for the filters' word; without it, it looks where the markers were last.
 POSES_TIMEOUT = 0.05
 # s that closing may take: for clients that do not answer, and for threads that hang in a driver.
@@ -459,9 +459,10 @@ class Service:
         while True:
             await asyncio.sleep(DIAGNOSE_EVERY)
             for name, robot in self.robots.items():
-                for text in robot.diagnose(time.monotonic()):
+                begin = time.monotonic()
+                for text in robot.diagnose(begin):
                     self._note(name, text)
-                await asyncio.sleep(0.0)  # Poses go out between two of them.
+                await asyncio.sleep((time.monotonic() - begin) / DIAGNOSE_SHARE)
             for name, camera in self.cameras.items():
                 for text in camera.news(time.monotonic()):
                     log.info("camera %s: %s", name, text)

@@ -14,7 +14,6 @@ import math
 import os
 import socket
 import ssl
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -37,7 +36,8 @@ from server.camera_messages import (
     encode,
     to_node,
 )
-from server.connecting import FIRST_PAUSE, connect_to_service, longer
+from server.connecting import FIRST_PAUSE, LONGEST_PAUSE, connect_to_service, longer
+from server.frames import FrameThread
 from server.messages import ClockAnswer, ClockQuestion, Error, MessageError, Notice
 from server.terminal import log_to_stderr, until_stopped
 
@@ -45,8 +45,6 @@ log = logging.getLogger("steadfix.camera")
 
 # s until the service must have answered the hello.
 HELLO_TIMEOUT = 10.0
-# s without a frame after which the camera counts as lost.
-READ_TIMEOUT = 5.0
 STATUS_EVERY = 1.0
 # Bytes that may wait in the kernel: what does not leave is to be replaced by what is newer.
 UNSENT = 2 * 1024
@@ -59,9 +57,9 @@ class NodeError(ValueError):
 
 
 class Watch:
-    """A thread that opens a camera as the welcome says, again whenever it is lost, and looks for markers in each frame.
+    """A camera that is opened as the welcome says, again whenever it is lost, and the markers in each of its frames.
 
-    `seen` gets what each frame showed, in that thread; `ended` is called there when a file is at its end. `trouble`
+    `seen` gets what each frame showed, in a thread; `ended` is called there when a file is at its end. `trouble`
     says in words what keeps it from its work, "" for nothing. Raises NodeError for a welcome that cannot be followed.
     """
 
@@ -71,17 +69,14 @@ class Watch:
         self.welcome = welcome
         self.trouble = "the camera is being opened"
         self.meter = DeliveryMeter()
-        self._open = open
         self._seen = seen
-        self._ended = ended
         try:
             self._tracker = MarkerTracker(welcome.dictionary, welcome.ids, welcome.still)
         except ValueError as error:
             raise NodeError(f"the service's welcome: {error}") from None
-        self._source: FrameSource | None = None
-        self._stop = threading.Event()
-        # A daemon: a driver that hangs must not keep the node from ending.
-        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
+        self._thread = FrameThread(
+            "camera", lambda: open(welcome), self._look, self._lost, ended, (FIRST_PAUSE, LONGEST_PAUSE)
+        )
         self._thread.start()
 
     def sizes_px(self, shortest_px: float, longest_px: float) -> None:
@@ -90,42 +85,13 @@ class Watch:
 
     def stop(self) -> None:
         """End the thread, and wait a moment for it to let go of the camera."""
-        self._stop.set()
-        if (source := self._source) is not None:
-            # Wakes a read that waits for a frame. It may itself wait for a driver that hangs.
-            threading.Thread(target=source.close, daemon=True).start()
+        self._thread.stop()
         self._thread.join(1.0)
 
-    def _run(self) -> None:
-        pause = FIRST_PAUSE
-        while not self._stop.is_set():
-            try:
-                if self._watch():
-                    self._ended()
-            except OSError as error:
-                trouble = str(error)
-            except Exception as error:
-                # A mistake of ours must not be hidden, nor end the node.
-                trouble = f"stopped by an error inside Steadfix: {error!r}"
-                log.debug("camera", exc_info=True)
-            else:
-                return
-            pause = longer(pause) if self.trouble else FIRST_PAUSE
-            if trouble != self.trouble:
-                log.warning("%s; trying again until it works", trouble)
-            self.trouble = trouble
-            self._stop.wait(pause)
-
-    def _watch(self) -> bool:
-        """Work until the source ends (True), is to stop (False) or is lost (OSError)."""
-        source = self._source = self._open(self.welcome)
-        try:
-            while (frame := source.read(READ_TIMEOUT)) is not None and not self._stop.is_set():
-                self._look(frame)
-            return not self._stop.is_set()
-        finally:
-            self._source = None
-            source.close()
+    def _lost(self, trouble: str) -> None:
+        if trouble != self.trouble:
+            log.warning("%s; trying again until it works", trouble)
+        self.trouble = trouble
 
     def _look(self, frame: Frame) -> None:
         start = time.monotonic()

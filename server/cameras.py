@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,14 +24,13 @@ from camera.tracking import MarkerTracker, Prediction
 from fusion.geometry import exp_so3, inverse, log_so3, rotation_about_z, transform, transform_points
 from fusion.measurements import Array, Pose, PoseFix
 from server.config import AnchorConfig, CameraConfig, Config, ConfigError, MarkerConfig
+from server.frames import FrameThread, Source
 from server.messages import tracker_message
 
 log = logging.getLogger("steadfix.camera")
 
 # s before a camera that is not there is tried again: the first pause, which doubles up to the longest.
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 30.0
-# s without a frame after which a camera counts as lost. The first frame of a USB camera takes a second or two.
-READ_TIMEOUT = 5.0
 # Frames whose anchor corners are averaged for one placement, and s between two such looks at the anchors.
 PLACEMENT_FRAMES = 10
 PLACEMENT_CHECK = 5.0
@@ -68,14 +66,7 @@ class SightedFrame:
     repeated: frozenset[int]
 
 
-class Source(Protocol):
-    """A FrameSource, or one whose frames were looked at elsewhere."""
-
-    def read(self, timeout: float) -> Frame | SightedFrame | None: ...
-    def close(self) -> None: ...
-
-
-Open = Callable[[CameraConfig], Source]
+Open = Callable[[CameraConfig], Source[Frame | SightedFrame]]
 
 
 def open_configured(config: CameraConfig) -> FrameSource:
@@ -113,7 +104,6 @@ class Camera:
         self.detect_ms = math.nan
         self._deliver = deliver
         self._tracker_wanted = tracker_wanted
-        self._open = open
         self._poses_at = poses_at
         if not Path(config.calibration).is_file():
             raise CalibrationError(
@@ -161,10 +151,14 @@ class Camera:
         # The anchors' corners while the camera hangs as it was found to, px, by id.
         self._at_rest: dict[int, Array] = {}
         self._arrivals: deque[float] = deque()
-        self._source: Source | None = None
-        self._stop = threading.Event()
-        # A daemon: a driver that hangs must not keep the service from ending.
-        self._thread = threading.Thread(target=self._run, name=f"camera {config.name}", daemon=True)
+        self._thread = FrameThread(
+            f"camera {config.name}",
+            lambda: open(config),
+            self._take,
+            self._lost,
+            self._ended,
+            (FIRST_PAUSE, LONGEST_PAUSE),
+        )
 
     @property
     def connected(self) -> bool:
@@ -176,58 +170,28 @@ class Camera:
 
     def stop(self) -> None:
         """Ask the thread to end; `join` waits for it."""
-        self._stop.set()
-        if (source := self._source) is not None:
-            # Wakes a read that waits for a frame. It may itself wait for a driver that hangs.
-            threading.Thread(target=source.close, daemon=True).start()
+        self._thread.stop()
 
     def join(self, timeout: float) -> None:
         if self._thread.ident is not None:
             self._thread.join(timeout)
 
-    def _run(self) -> None:
-        pause = FIRST_PAUSE
-        while not self._stop.is_set():
-            frames = self.frames
-            try:
-                if self._watch():
-                    return
-            except (OSError, CalibrationError) as error:
-                trouble = str(error)
-            except Exception as error:
-                # A mistake of ours must not end the other cameras, nor be hidden.
-                trouble = f"stopped by an error inside Steadfix: {error!r}"
-                log.debug("camera %s", self.config.name, exc_info=True)
-            if self.frames > frames:
-                pause = FIRST_PAUSE
-            if trouble != self.status:
-                log.warning("camera %s: %s; trying again until it works", self.config.name, trouble)
-            self.status = trouble
-            self._stop.wait(pause)
-            pause = min(2.0 * pause, LONGEST_PAUSE)
+    def _lost(self, trouble: str) -> None:
+        if trouble != self.status:
+            log.warning("camera %s: %s; trying again until it works", self.config.name, trouble)
+        self.status = trouble
 
-    def _watch(self) -> bool:
-        """Work until the source ends (True) or is lost (OSError)."""
-        source = self._source = self._open(self.config)
-        try:
-            while not self._stop.is_set():
-                frame = source.read(READ_TIMEOUT)
-                if self._stop.is_set():
-                    break
-                if frame is None:
-                    self.status = "the source has ended"
-                    log.info("camera %s: %s", self.config.name, self.status)
-                    return True
-                seen = self._see(frame)
-                # Not before: a frame of the wrong size is no success.
-                if self.status and self.connected:
-                    log.info("camera %s: frames are coming", self.config.name)
-                    self.status = ""
-                self._deliver(seen)
-        finally:
-            self._source = None
-            source.close()
-        return True
+    def _ended(self) -> None:
+        self.status = "the source has ended"
+        log.info("camera %s: %s", self.config.name, self.status)
+
+    def _take(self, frame: Frame | SightedFrame) -> None:
+        seen = self._see(frame)
+        # Not before: a frame of the wrong size is no success.
+        if self.status and self.connected:
+            log.info("camera %s: frames are coming", self.config.name)
+            self.status = ""
+        self._deliver(seen)
 
     def _see(self, frame: Frame | SightedFrame) -> Seen:
         arrival = time.monotonic()

@@ -7,7 +7,7 @@ import ssl
 from websockets.asyncio.client import connect
 
 # s before trying again: the first pause, which `longer` doubles up to the longest.
-FIRST_PAUSE, _LONGEST_PAUSE = 0.25, 5.0
+FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
 # s between asking the service for a sign of life, and until a connection without one is given up.
 _PING_INTERVAL, _PING_TIMEOUT = 2.0, 3.0
 
@@ -27,4 +27,4 @@ def connect_to_service(url: str, tls: ssl.SSLContext | None) -> connect:
 
 def longer(pause: float) -> float:
     """The pause after another failure."""
-    return min(2.0 * pause, _LONGEST_PAUSE)
+    return min(2.0 * pause, LONGEST_PAUSE)

@@ -25,8 +25,9 @@ from camera.images import Pixels
 from camera.markers import MarkerDetector, MarkerSighting
 from fusion.geometry import inverse, quaternion_from_rotation, transform_points, yaw_of
 from fusion.measurements import Array
-from server.cameras import READ_TIMEOUT, configured_anchor, open_configured
+from server.cameras import configured_anchor, open_configured
 from server.config import CameraConfig, Config, ConfigError, load
+from server.frames import READ_TIMEOUT
 
 # Frames of a live camera whose corners are averaged, and s after which a camera that sees no anchor is given up.
 FRAMES, PATIENCE = 20, 30.0

@@ -155,7 +155,7 @@ class RemoteCamera(Camera):
                 tending.cancel()
             if self._connection is connection:
                 self._connection = None
-            if self._connection is None and not self._stop.is_set():
+            if self._connection is None and not self._thread.stopping.is_set():
                 # A frame may have come after what the node said last.
                 self._say(f"its node ({node}) has gone; waiting for it{self._trouble and f' ({self._trouble})'}")
 
