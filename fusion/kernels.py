@@ -1865,6 +1865,29 @@ def process(memory, task, channel, t, inputs, outputs):
     return 1
 
 
+_VECTOR, _MATRIX = types.float64[::1], types.float64[:, ::1]
+
+
+def compile_taking() -> None:
+    """Compile what takes fixes and readings of the wheels: half of the work.
+
+    Where these signatures are not those that `process` calls with, that is so much work for nothing, and no more.
+    """
+    _take.compile((_VECTOR, _VECTOR, _MATRIX, _MATRIX, types.int64))
+
+
+def compile_moving() -> None:
+    """Compile most of the other half: two processes can share the work, since both write to numba's cache."""
+    _run_to.compile((_VECTOR, _VECTOR, _MATRIX, types.int64, _MATRIX, types.int64, types.float64))
+    _next_sample.compile((_VECTOR, _VECTOR, _MATRIX, types.int64))
+    _watch.compile((_VECTOR, _VECTOR, _MATRIX, _VECTOR, types.int64))
+    _absorb.compile((_VECTOR, _VECTOR, _VECTOR, types.boolean))
+    _insert_fix.compile((_VECTOR, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _VECTOR))
+    _write_pose.compile((_VECTOR, _VECTOR))
+    _move.compile((_VECTOR, _VECTOR, _VECTOR, types.float64))
+    _grid.compile((_VECTOR, _VECTOR))
+
+
 def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
     """Meta, parameters, state, smooth channel, IMU ring, fix ring and checkpoint ring of one robot's memory."""
     wheels = WHEEL_CAPACITY * WHEEL_ROW

@@ -32,7 +32,6 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
-from fusion.localiser import warm_up
 from fusion.measurements import Pose
 from fusion.params import Channel
 from imu.protocols.detection import Detector, open_parser
@@ -41,6 +40,7 @@ from server.access import bearer, is_local, is_loopback, origin_allowed, tls, to
 from server.camera_messages import camera_hello
 from server.cameras import FIRST_PAUSE, LONGEST_PAUSE, Camera, Open, Seen, open_configured
 from server.clock_questions import ClockQuestions
+from server.compiling import NOTICE, PATIENCE, load_or_compile
 from server.config import CameraConfig, Config
 from server.hub import STALL_LIMIT, Hub, Subscription, Topic
 from server.listening import cannot_listen, response
@@ -302,7 +302,7 @@ class Service:
         def work() -> None:
             try:
                 for engine in sorted({robot.config.engine for robot in self.robots.values()}):
-                    warm_up(engine)
+                    load_or_compile(engine)
             except Exception as error:
                 self._call_from_thread(end, error)
             else:
@@ -310,10 +310,7 @@ class Service:
 
         # A daemon, unlike the threads of asyncio: compiling must not keep the service from ending.
         threading.Thread(target=work, name="warm-up", daemon=True).start()
-        # Loading takes a moment, compiling a while: only that needs an explanation.
-        notice = self._loop.call_later(
-            3.0, log.info, "compiling the filters; this happens once after each update and may take a minute"
-        )
+        notice = self._loop.call_later(PATIENCE, log.info, NOTICE)
         try:
             await asyncio.shield(warm)
         finally:
