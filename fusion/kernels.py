@@ -207,6 +207,7 @@ LEAST_EXCESS, MOST_EXCESS = -1.0, 8.0  # bounds of EXCESS: e^8 is 55 times the s
 IGNORED_EXCESS = 0.7  # less is chance: matched noise wanders about so far
 ADAPTATION_HZ = 2.0  # fixes more often than this share their say in the noise
 NOTHING, A_FIX, A_READING = range(3)
+BRIDGED, MEASURED = 0.0, 1.0  # numbers, since numba compiles anew for each other constant bool
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
 STILL_SPEED_SIGMA = 0.002  # m/s
@@ -358,7 +359,7 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise):
 
 
 @_fused
-def spread(f, gyro_bias_walk, accel_bias_walk):
+def spread(f, measured, gyro_bias_walk, accel_bias_walk):
     """Bring P of the filter f (BLOCK,) up to the nominal state: over `LAG` seconds, several samples at once.
 
     With Δv, Δp what specific force has added to velocity and position, in the body axes at the *start*, A = R̂ᵀR̂_start
@@ -369,7 +370,7 @@ def spread(f, gyro_bias_walk, accel_bias_walk):
         δp' = A (δp + dt δv - Δp × δθ - dt²/2 δba + dt/2 C δc)
 
     which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
-    A drops out of Q.
+    A drops out of Q. What is not `measured` by an IMU does not depend on its biases, nor on where gravity seems to be.
 
     The filter is an array of its own here: with an offset in the index the loops over P are not vectorised.
     """
@@ -396,6 +397,9 @@ def spread(f, gyro_bias_walk, accel_bias_walk):
     a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
     a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
     a02, a12, a22 = 2.0 * (ex * ez - ew * ey), 2.0 * (ey * ez + ew * ex), 1.0 - 2.0 * (ex * ex + ey * ey)
+    b = dt
+    if measured != MEASURED:
+        b = d0 = d1 = d2 = c00 = c10 = c20 = c01 = c11 = c21 = 0.0
     c = COV
     # F P Fᵀ as F (F P)ᵀ: the same loop twice, over columns that lie side by side in memory. The second round is needed
     # for the first nine columns only, since F leaves the rest alone.
@@ -405,18 +409,18 @@ def spread(f, gyro_bias_walk, accel_bias_walk):
             v0, v1, v2 = f[c + 60 + j], f[c + 80 + j], f[c + 100 + j]
             p0, p1, p2 = f[c + 120 + j], f[c + 140 + j], f[c + 160 + j]
             e0, e1 = f[c + 320 + j], f[c + 340 + j]
-            u0 = d2 * t1 - d1 * t2 - dt * f[c + 240 + j] + c00 * e0 + c01 * e1
-            u1 = d0 * t2 - d2 * t0 - dt * f[c + 260 + j] + c10 * e0 + c11 * e1
-            u2 = d1 * t0 - d0 * t1 - dt * f[c + 280 + j] + c20 * e0 + c21 * e1
+            u0 = d2 * t1 - d1 * t2 - b * f[c + 240 + j] + c00 * e0 + c01 * e1
+            u1 = d0 * t2 - d2 * t0 - b * f[c + 260 + j] + c10 * e0 + c11 * e1
+            u2 = d1 * t0 - d0 * t1 - b * f[c + 280 + j] + c20 * e0 + c21 * e1
             p0 += dt * v0 + h * u0
             p1 += dt * v1 + h * u1
             p2 += dt * v2 + h * u2
             v0 += u0
             v1 += u1
             v2 += u2
-            t0 -= dt * f[c + 180 + j]
-            t1 -= dt * f[c + 200 + j]
-            t2 -= dt * f[c + 220 + j]
+            t0 -= b * f[c + 180 + j]
+            t1 -= b * f[c + 200 + j]
+            t2 -= b * f[c + 220 + j]
             f[c + j] = a00 * t0 + a01 * t1 + a02 * t2
             f[c + 20 + j] = a10 * t0 + a11 * t1 + a12 * t2
             f[c + 40 + j] = a20 * t0 + a21 * t1 + a22 * t2
@@ -1294,9 +1298,9 @@ def _next_sample(s, prm, imu, k):
 
 @_jit
 def _settle(s, prm):
-    """Bring the covariances up to T, for whatever reads or changes them."""
+    """Bring the covariances up to T by what the IMU has said, for whatever reads or changes them."""
     for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
+        spread(s[o : o + BLOCK], MEASURED, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
 
 
 @_jit
@@ -1315,6 +1319,7 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
     # An offset that has just shrunk can put a fix before the one before it, by its change: it is taken now.
     dt = t - s[T]
     if s[BRIDGING] > 0.0:
+        _settle(s, prm)
         # after longer than that nothing is known any less
         dt = min(dt, MOST_BRIDGED)
     if dt > 0.0:
@@ -1358,7 +1363,7 @@ def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
                         rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
                 predict(s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt, rate_noise, force_noise)
                 if s[BRIDGING] > 0.0:
-                    spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
+                    spread(s[o : o + BLOCK], BRIDGED, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
                     _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
         if part == 1.0:
             for i in range(6):
