@@ -622,7 +622,7 @@ class Service:
     def _answer_robot(self, robot: Robot, link: _Link, subscription: Subscription) -> None:
         """Its pose at once, with what it just sent in it, as far as the rate that it asked for allows."""
         now = time.monotonic()
-        if subscription.topics and self.ready.is_set() and subscription.is_due(now, early=subscription.interval):
+        if subscription.topics and self.ready.is_set() and self.hub.is_due(now, subscription, answer=True):
             pose = self._pose(robot, now)
             if pose is not None:
                 self.hub.send(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
