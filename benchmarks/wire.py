@@ -9,11 +9,13 @@ import os
 import time
 import timeit
 from collections import deque
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 import msgspec
 import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.server import ServerConnection, broadcast, serve
 
 from fusion.measurements import Array, ImuBatch, Pose, PoseFix, PoseHypothesis, WheelOdometry
 from server.app import Service
@@ -51,20 +53,28 @@ def decoding() -> None:
 
 def robots() -> None:
     """Prints the share of a core that the service takes for one robot and for fifty, each with a filter and two fixes a
-    second, and how long after a batch has come the first pose that holds it leaves."""
+    second, and how long after a batch has come the first pose that holds it leaves.
+
+    Before that the share of what the same messages take where nothing is done with them: both depend on what else the
+    machine does, their ratio less.
+    """
     print(f"{'robots':>7}{'samples/s':>11}{'poses/s':>9}{'of a core':>11}{'p50 ms':>9}{'p99 ms':>9}{'format':>10}")
+    share, samples, poses, _ = _run(_traffic, ROBOTS, "json", latency=False)
+    print(f"{ROBOTS:7}{samples:11.0f}{poses:9.0f}{share:11.3f}{'traffic alone':>28}", flush=True)
     for count, format in ((1, "json"), (ROBOTS, "json"), (ROBOTS, "msgpack")):
-        share, samples, poses, _ = _run(count, format, latency=False)
-        *_, delays = _run(count, format, latency=True)
+        share, samples, poses, _ = _run(_service, count, format, latency=False)
+        *_, delays = _run(_service, count, format, latency=True)
         p50, p99 = 1e3 * np.percentile(delays, (50, 99))
         print(f"{count:7}{samples:11.0f}{poses:9.0f}{share:11.3f}{p50:9.2f}{p99:9.2f}{format:>10}", flush=True)
     print(f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
-def _run(count: int, format: str, latency: bool) -> tuple[float, float, float, Array]:
+def _run(
+    serving: Callable[[Connection, int, bool], None], count: int, format: str, latency: bool
+) -> tuple[float, float, float, Array]:
     context = mp.get_context("spawn")
     ours, theirs = context.Pipe()
-    service = context.Process(target=_service, args=(theirs, count, latency), daemon=True)
+    service = context.Process(target=serving, args=(theirs, count, latency), daemon=True)
     service.start()
     clients = context.Process(target=_clients, args=(ours.recv(), count, format), daemon=True)
     clients.start()
@@ -112,26 +122,68 @@ def _service(pipe: Connection, count: int, latency: bool) -> None:
             fixing = asyncio.create_task(fixes(service))
             pipe.send(service.port)
             await asyncio.sleep(SETTLE)
-            before = time.process_time(), time.monotonic(), *counts(service)
             delays.found.clear()
-            await asyncio.sleep(MEASURE)
-            took, passed, samples, poses = (
-                b - a for a, b in zip(before, (time.process_time(), time.monotonic(), *counts(service)), strict=True)
-            )
+            shares = await _measured(lambda: counts(service))
             fixing.cancel()
-            pipe.send((took / passed, samples / passed, poses / passed, np.array(delays.found)))
+            pipe.send((*shares, np.array(delays.found)))
             await asyncio.Event().wait()
 
     async def fixes(service: Service) -> None:
+        due = time.monotonic()
         while True:
             for name, robot in service.robots.items():
-                await asyncio.sleep(FIX_EVERY / count)
+                due += FIX_EVERY / count
+                await asyncio.sleep(due - time.monotonic())
                 now = time.monotonic()
                 robot.feed_fix(PoseFix(name, now - FIX_DELAY, now, (pose,)), now)
 
     def counts(service: Service) -> tuple[int, int]:
         robots = service.robots.values()
         return sum(robot.localiser.counts["imu_samples"] for robot in robots), sum(robot.published for robot in robots)
+
+    asyncio.run(main())
+
+
+async def _measured(counts: Callable[[], tuple[int, int]]) -> tuple[float, float, float]:
+    """The share of a core over a while, and samples and poses a second, of which `counts` tells how many there were."""
+    before = time.process_time(), time.monotonic(), *counts()
+    await asyncio.sleep(MEASURE)
+    now = time.process_time(), time.monotonic(), *counts()
+    took, passed, samples, poses = (b - a for a, b in zip(before, now, strict=True))
+    return took / passed, samples / passed, poses / passed
+
+
+def _traffic(pipe: Connection, count: int, latency: bool) -> None:
+    """In the place of `_service`: it takes the batches unread, and sends as many bytes as poses have."""
+    pose = 1100 * b" "
+    batches = poses = 0
+    connections: set[ServerConnection] = set()
+
+    async def serve_one(connection: ServerConnection) -> None:
+        nonlocal batches, poses
+        await connection.recv()
+        connections.add(connection)
+        async for _ in connection:
+            batches, poses = batches + 1, poses + 1
+            broadcast([connection], pose, text=True)
+
+    async def main() -> None:
+        nonlocal poses
+        async with serve(serve_one, "127.0.0.1", 0, compression=None) as server:
+            pipe.send(server.sockets[0].getsockname()[1])
+            await asyncio.sleep(SETTLE)
+            measuring = asyncio.create_task(_measured(lambda: (BATCH * batches, poses)))
+            due, tick = time.monotonic(), 0
+            while not measuring.done():
+                # Besides the answers, in three ticks of five: 50 a second in all.
+                for i, connection in enumerate(connections):
+                    if (i + tick) % 5 < 3:
+                        poses += 1
+                        broadcast([connection], pose, text=True)
+                due, tick = due + 1.0 / POSE_RATE_HZ, tick + 1
+                await asyncio.sleep(due - time.monotonic())
+            pipe.send((*measuring.result(), np.zeros(0)))
+            await asyncio.Event().wait()
 
     asyncio.run(main())
 

@@ -207,6 +207,7 @@ LEAST_EXCESS, MOST_EXCESS = -1.0, 8.0  # bounds of EXCESS: e^8 is 55 times the s
 IGNORED_EXCESS = 0.7  # less is chance: matched noise wanders about so far
 ADAPTATION_HZ = 2.0  # fixes more often than this share their say in the noise
 NOTHING, A_FIX, A_READING = range(3)
+BRIDGED, MEASURED = 0.0, 1.0  # numbers, since numba compiles anew for each other constant bool
 STILL_WINDOW = 0.25  # s
 STILL_AFTER = 0.3  # s: so long after the first window at rest the updates begin
 STILL_SPEED_SIGMA = 0.002  # m/s
@@ -358,7 +359,7 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise):
 
 
 @_fused
-def spread(f, gyro_bias_walk, accel_bias_walk):
+def spread(f, measured, gyro_bias_walk, accel_bias_walk):
     """Bring P of the filter f (BLOCK,) up to the nominal state: over `LAG` seconds, several samples at once.
 
     With Δv, Δp what specific force has added to velocity and position, in the body axes at the *start*, A = R̂ᵀR̂_start
@@ -369,7 +370,7 @@ def spread(f, gyro_bias_walk, accel_bias_walk):
         δp' = A (δp + dt δv - Δp × δθ - dt²/2 δba + dt/2 C δc)
 
     which is exact for the coupling by attitude, since the start axes do not turn. White noise is isotropic, so that
-    A drops out of Q.
+    A drops out of Q. What is not `measured` by an IMU does not depend on its biases, nor on where gravity seems to be.
 
     The filter is an array of its own here: with an offset in the index the loops over P are not vectorised.
     """
@@ -396,6 +397,9 @@ def spread(f, gyro_bias_walk, accel_bias_walk):
     a00, a10, a20 = 1.0 - 2.0 * (ey * ey + ez * ez), 2.0 * (ex * ey - ew * ez), 2.0 * (ex * ez + ew * ey)
     a01, a11, a21 = 2.0 * (ex * ey + ew * ez), 1.0 - 2.0 * (ex * ex + ez * ez), 2.0 * (ey * ez - ew * ex)
     a02, a12, a22 = 2.0 * (ex * ez - ew * ey), 2.0 * (ey * ez + ew * ex), 1.0 - 2.0 * (ex * ex + ey * ey)
+    b = dt
+    if measured != MEASURED:
+        b = d0 = d1 = d2 = c00 = c10 = c20 = c01 = c11 = c21 = 0.0
     c = COV
     # F P Fᵀ as F (F P)ᵀ: the same loop twice, over columns that lie side by side in memory. The second round is needed
     # for the first nine columns only, since F leaves the rest alone.
@@ -405,18 +409,18 @@ def spread(f, gyro_bias_walk, accel_bias_walk):
             v0, v1, v2 = f[c + 60 + j], f[c + 80 + j], f[c + 100 + j]
             p0, p1, p2 = f[c + 120 + j], f[c + 140 + j], f[c + 160 + j]
             e0, e1 = f[c + 320 + j], f[c + 340 + j]
-            u0 = d2 * t1 - d1 * t2 - dt * f[c + 240 + j] + c00 * e0 + c01 * e1
-            u1 = d0 * t2 - d2 * t0 - dt * f[c + 260 + j] + c10 * e0 + c11 * e1
-            u2 = d1 * t0 - d0 * t1 - dt * f[c + 280 + j] + c20 * e0 + c21 * e1
+            u0 = d2 * t1 - d1 * t2 - b * f[c + 240 + j] + c00 * e0 + c01 * e1
+            u1 = d0 * t2 - d2 * t0 - b * f[c + 260 + j] + c10 * e0 + c11 * e1
+            u2 = d1 * t0 - d0 * t1 - b * f[c + 280 + j] + c20 * e0 + c21 * e1
             p0 += dt * v0 + h * u0
             p1 += dt * v1 + h * u1
             p2 += dt * v2 + h * u2
             v0 += u0
             v1 += u1
             v2 += u2
-            t0 -= dt * f[c + 180 + j]
-            t1 -= dt * f[c + 200 + j]
-            t2 -= dt * f[c + 220 + j]
+            t0 -= b * f[c + 180 + j]
+            t1 -= b * f[c + 200 + j]
+            t2 -= b * f[c + 220 + j]
             f[c + j] = a00 * t0 + a01 * t1 + a02 * t2
             f[c + 20 + j] = a10 * t0 + a11 * t1 + a12 * t2
             f[c + 40 + j] = a20 * t0 + a21 * t1 + a22 * t2
@@ -1323,100 +1327,103 @@ def _next_sample(s, prm, imu, k):
 
 @_jit
 def _settle(s, prm):
-    """Bring the covariances up to T, for whatever reads or changes them."""
+    """Bring the covariances up to T by what the IMU has said, for whatever reads or changes them."""
     for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
+        spread(s[o : o + BLOCK], MEASURED, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
 
 
 @_jit
 def _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t_end):
-    """Carry the state to t_end, on its way to the next sample, and take all that is due until then at its instant."""
-    while True:
-        cursor = int(s[FIX_CURSOR])
-        t = t_end
-        due = NOTHING
-        if cursor < fix_end:
-            t_fix = fixes[cursor & FIX_MASK, F_T] + s[TD_APPLIED]
-            if t_fix <= t_end:
-                t, due = t_fix, A_FIX
-        wheel = int(s[WHEEL_CURSOR])
-        if wheel < wheel_end and wheels[wheel & WHEEL_MASK, 0] <= t:
-            t, due = wheels[wheel & WHEEL_MASK, 0], A_READING
-        # An offset that has just shrunk can put a fix before the one before it, by its change: it is taken now.
-        dt = t - s[T]
-        if s[BRIDGING] > 0.0:
-            # after longer than that nothing is known any less
-            dt = min(dt, MOST_BRIDGED)
-        if dt > 0.0:
-            # the input at t, on the line from the state's to the next sample's; its mean on the way there
-            part = 1.0
-            if t < s[NEXT_T] and math.isfinite(s[T]):
-                part = dt / (s[NEXT_T] - s[T])
-            if s[INITIALISED] > 0.0:
-                gx = s[U] + 0.5 * part * (s[NEXT_U] - s[U])
-                gy = s[U + 1] + 0.5 * part * (s[NEXT_U + 1] - s[U + 1])
-                gz = s[U + 2] + 0.5 * part * (s[NEXT_U + 2] - s[U + 2])
-                ax = s[U + 3] + 0.5 * part * (s[NEXT_U + 3] - s[U + 3])
-                ay = s[U + 4] + 0.5 * part * (s[NEXT_U + 4] - s[U + 4])
-                az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
-                rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
-                # An accelerometer that shakes three times as much as its noise says has more of it.
-                shaken2 = s[CHANGE_ACCEL] / 6.0 * min(s[NEXT_T] - s[T_IMU], prm[IMU_GAP])
-                if shaken2 > 9.0 * prm[ACCEL_NOISE] * prm[ACCEL_NOISE]:
-                    force_noise = max(force_noise, math.sqrt(shaken2) - 2.0 * prm[ACCEL_NOISE])
-                if s[BLIND] > 0.0:
-                    # anything up to several times what it has ever said
-                    rate_noise, force_noise = s[LARGEST_GYRO] * BLIND_TIME, s[LARGEST_ACCEL] * BLIND_TIME
-                for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
-                    if s[BRIDGING] > 0.0:
-                        # Straight on: the input that says so is the bias, and gravity seen from the body.
-                        c0, c1 = s[o + TILT], s[o + TILT + 1]
-                        c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
-                        w, x, y, z = s[o], s[o + 1], s[o + 2], s[o + 3]
-                        gx, gy, gz = s[o + BG], s[o + BG + 1], s[o + BG + 2]
-                        turns = t - s[T_WHEEL] <= prm[IMU_GAP]
-                        if turns:
-                            gz += s[WHEEL_RATE]
-                        ax = (1.0 - 2.0 * (y * y + z * z)) * c0 + 2.0 * ((x * y + w * z) * c1 + (x * z - w * y) * c2)
-                        ay = (1.0 - 2.0 * (x * x + z * z)) * c1 + 2.0 * ((x * y - w * z) * c0 + (y * z + w * x) * c2)
-                        az = (1.0 - 2.0 * (x * x + y * y)) * c2 + 2.0 * ((x * z + w * y) * c0 + (y * z - w * x) * c1)
-                        ax = GRAVITY * ax + s[o + BA]
-                        ay = GRAVITY * ay + s[o + BA + 1]
-                        az = GRAVITY * az + s[o + BA + 2]
-                        rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
-                        if turns:
-                            rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
-                    predict(s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt, rate_noise, force_noise)
-                    if s[BRIDGING] > 0.0:
-                        spread(s[o : o + BLOCK], prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
-                        _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
-            if part == 1.0:
-                for i in range(6):
-                    s[U + i] = s[NEXT_U + i]
-            else:
-                for i in range(6):
-                    s[U + i] += part * (s[NEXT_U + i] - s[U + i])
-            s[T] = t
-        if due != NOTHING or s[LAG] > LONGEST_LAG or math.floor(t * GRID_HZ) != s[GRID_AT]:
-            _settle(s, prm)
-        if due == NOTHING:
-            return
-        if due == A_READING:
-            if s[INITIALISED] > 0.0:
-                _odometry(s, prm, wheels[wheel & WHEEL_MASK])
-            s[WHEEL_CURSOR] = wheel + 1
+    """Carry the state to t_end, on its way to the next sample, or to what is due before. -> what that is."""
+    cursor = int(s[FIX_CURSOR])
+    t = t_end
+    due = NOTHING
+    if cursor < fix_end:
+        t_fix = fixes[cursor & FIX_MASK, F_T] + s[TD_APPLIED]
+        if t_fix <= t_end:
+            t, due = t_fix, A_FIX
+    wheel = int(s[WHEEL_CURSOR])
+    if wheel < wheel_end and wheels[wheel & WHEEL_MASK, 0] <= t:
+        t, due = wheels[wheel & WHEEL_MASK, 0], A_READING
+    # An offset that has just shrunk can put a fix before the one before it, by its change: it is taken now.
+    dt = t - s[T]
+    if s[BRIDGING] > 0.0:
+        _settle(s, prm)
+        # after longer than that nothing is known any less
+        dt = min(dt, MOST_BRIDGED)
+    if dt > 0.0:
+        # the input at t, on the line from the state's to the next sample's; its mean on the way there
+        part = 1.0
+        if t < s[NEXT_T] and math.isfinite(s[T]):
+            part = dt / (s[NEXT_T] - s[T])
+        if s[INITIALISED] > 0.0:
+            gx = s[U] + 0.5 * part * (s[NEXT_U] - s[U])
+            gy = s[U + 1] + 0.5 * part * (s[NEXT_U + 1] - s[U + 1])
+            gz = s[U + 2] + 0.5 * part * (s[NEXT_U + 2] - s[U + 2])
+            ax = s[U + 3] + 0.5 * part * (s[NEXT_U + 3] - s[U + 3])
+            ay = s[U + 4] + 0.5 * part * (s[NEXT_U + 4] - s[U + 4])
+            az = s[U + 5] + 0.5 * part * (s[NEXT_U + 5] - s[U + 5])
+            rate_noise, force_noise = prm[GYRO_NOISE] * s[SCALE + 1], prm[ACCEL_NOISE] * s[SCALE]
+            # An accelerometer that shakes three times as much as its noise says has more of it.
+            shaken2 = s[CHANGE_ACCEL] / 6.0 * min(s[NEXT_T] - s[T_IMU], prm[IMU_GAP])
+            if shaken2 > 9.0 * prm[ACCEL_NOISE] * prm[ACCEL_NOISE]:
+                force_noise = max(force_noise, math.sqrt(shaken2) - 2.0 * prm[ACCEL_NOISE])
+            if s[BLIND] > 0.0:
+                # anything up to several times what it has ever said
+                rate_noise, force_noise = s[LARGEST_GYRO] * BLIND_TIME, s[LARGEST_ACCEL] * BLIND_TIME
+            for o in range(MAIN, SHADOW + 1 if s[SHADOW_COUNT] > 0.0 else SHADOW, BLOCK):
+                if s[BRIDGING] > 0.0:
+                    # Straight on: the input that says so is the bias, and gravity seen from the body.
+                    c0, c1 = s[o + TILT], s[o + TILT + 1]
+                    c2 = math.sqrt(1.0 - c0 * c0 - c1 * c1)
+                    w, x, y, z = s[o], s[o + 1], s[o + 2], s[o + 3]
+                    gx, gy, gz = s[o + BG], s[o + BG + 1], s[o + BG + 2]
+                    turns = t - s[T_WHEEL] <= prm[IMU_GAP]
+                    if turns:
+                        gz += s[WHEEL_RATE]
+                    ax = (1.0 - 2.0 * (y * y + z * z)) * c0 + 2.0 * ((x * y + w * z) * c1 + (x * z - w * y) * c2)
+                    ay = (1.0 - 2.0 * (x * x + z * z)) * c1 + 2.0 * ((x * y - w * z) * c0 + (y * z + w * x) * c2)
+                    az = (1.0 - 2.0 * (x * x + y * y)) * c2 + 2.0 * ((x * z + w * y) * c0 + (y * z - w * x) * c1)
+                    ax = GRAVITY * ax + s[o + BA]
+                    ay = GRAVITY * ay + s[o + BA + 1]
+                    az = GRAVITY * az + s[o + BA + 2]
+                    rate_noise, force_noise = prm[NO_IMU_RATE_NOISE], 0.0
+                    if turns:
+                        rate_noise = prm[WHEEL_RATE_SIGMA] / math.sqrt(GRID_HZ)
+                predict(s[o : o + BLOCK], gx, gy, gz, ax, ay, az, dt, rate_noise, force_noise)
+                if s[BRIDGING] > 0.0:
+                    spread(s[o : o + BLOCK], BRIDGED, prm[GYRO_BIAS_WALK], prm[ACCEL_BIAS_WALK])
+                    _slow(s[o : o + BLOCK], dt, prm[NO_IMU_ACCEL_NOISE])
+        if part == 1.0:
+            for i in range(6):
+                s[U + i] = s[NEXT_U + i]
         else:
-            fix = fixes[cursor & FIX_MASK]
-            if s[INITIALISED] > 0.0:
-                _judge(s, prm, fix)
-            else:
-                _initialise(s, prm, fix)
-                fix[F_OUTCOME] = INIT
-            s[TD_APPLIED] = s[TD]
-            s[FIX_CURSOR] = cursor + 1
-        if s[BRIDGING] > 0.0:
-            # no sample may come to do it
-            _grid(s, prm)
+            for i in range(6):
+                s[U + i] += part * (s[NEXT_U + i] - s[U + i])
+        s[T] = t
+    if due != NOTHING or s[LAG] > LONGEST_LAG or math.floor(t * GRID_HZ) != s[GRID_AT]:
+        _settle(s, prm)
+    return due
+
+
+@_jit
+def _take(s, prm, fixes, wheels, due):
+    """The fix or the reading that is due at T."""
+    if due == A_READING:
+        number = int(s[WHEEL_CURSOR])
+        if s[INITIALISED] > 0.0:
+            _odometry(s, prm, wheels[number & WHEEL_MASK])
+        s[WHEEL_CURSOR] = number + 1
+    else:
+        number = int(s[FIX_CURSOR])
+        fix = fixes[number & FIX_MASK]
+        if s[INITIALISED] > 0.0:
+            _judge(s, prm, fix)
+        else:
+            _initialise(s, prm, fix)
+            fix[F_OUTCOME] = INIT
+        s[TD_APPLIED] = s[TD]
+        s[FIX_CURSOR] = number + 1
 
 
 @_jit
@@ -1475,7 +1482,14 @@ def _advance(s, prm, imu, fixes, fix_end, wheels, wheel_end, checkpoints, meta, 
             _fill(s[NEXT_U : NEXT_U + 6], s[U:])
         else:
             break
-        _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t)
+        while True:
+            due = _run_to(s, prm, fixes, fix_end, wheels, wheel_end, t)
+            if due == NOTHING:
+                break
+            _take(s, prm, fixes, wheels, due)
+            if s[BRIDGING] > 0.0:
+                # no sample may come to do it
+                _grid(s, prm)
         s[TRAILING] = trailing
         if sample and t == imu[row, 0]:
             if s[INITIALISED] > 0.0:
@@ -1883,6 +1897,29 @@ def process(memory, task, channel, t, inputs, outputs):
                 for j in range(6):
                     out[P_COV + 6 * i + j] += left[i] * left[j]
     return 1
+
+
+_VECTOR, _MATRIX = types.float64[::1], types.float64[:, ::1]
+
+
+def compile_taking() -> None:
+    """Compile what takes fixes and readings of the wheels: half of the work.
+
+    Where these signatures are not those that `process` calls with, that is so much work for nothing, and no more.
+    """
+    _take.compile((_VECTOR, _VECTOR, _MATRIX, _MATRIX, types.int64))
+
+
+def compile_moving() -> None:
+    """Compile most of the other half: two processes can share the work, since both write to numba's cache."""
+    _run_to.compile((_VECTOR, _VECTOR, _MATRIX, types.int64, _MATRIX, types.int64, types.float64))
+    _next_sample.compile((_VECTOR, _VECTOR, _MATRIX, types.int64))
+    _watch.compile((_VECTOR, _VECTOR, _MATRIX, _VECTOR, types.int64))
+    _absorb.compile((_VECTOR, _VECTOR, _VECTOR, types.boolean))
+    _insert_fix.compile((_VECTOR, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _VECTOR))
+    _write_pose.compile((_VECTOR, _VECTOR))
+    _move.compile((_VECTOR, _VECTOR, _VECTOR, types.float64))
+    _grid.compile((_VECTOR, _VECTOR))
 
 
 def views(memory: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]:

@@ -128,18 +128,19 @@ class Localiser:
 
     def _outcome(self, row: Array) -> FixOutcome:
         t, arrival = float(row[k.F_T]), float(row[k.F_ARRIVAL])
+        outcome, d2, d2_position, d2_attitude, chosen, margin = row[k.F_OUTCOME : k.F_INNOVATION].tolist()
         return FixOutcome(
             robot=self.robot,
             t=t,
             arrival=arrival,
-            outcome=Outcome(int(row[k.F_OUTCOME])),
-            d2=float(row[k.F_D2]),
-            d2_position=float(row[k.F_D2_POSITION]),
-            d2_attitude=float(row[k.F_D2_ATTITUDE]),
+            outcome=Outcome(outcome),
+            d2=d2,
+            d2_position=d2_position,
+            d2_attitude=d2_attitude,
             innovation=row[k.F_INNOVATION : k.F_INNOVATION + 6],
             innovation_sigma=row[k.F_SIGMA : k.F_SIGMA + 6],
-            hypothesis=0 if math.isnan(row[k.F_CHOSEN]) else int(row[k.F_CHOSEN]),
-            margin=float(row[k.F_MARGIN]),
+            hypothesis=0 if math.isnan(chosen) else int(chosen),
+            margin=margin,
             source=self._sources.pop((t, arrival), ""),
         )
 

@@ -206,8 +206,7 @@ class Outcome(IntEnum):
     DUPLICATE = 7
 
 
-@dataclass(frozen=True, slots=True)
-class FixOutcome:
+class FixOutcome(msgspec.Struct, frozen=True, eq=False):
     """How a fix was judged.
 
     `d2`: squared Mahalanobis distance of the innovation (6 dof), `d2_position` and `d2_attitude` of its halves (3).
@@ -222,8 +221,8 @@ class FixOutcome:
     d2: float = math.nan
     d2_position: float = math.nan
     d2_attitude: float = math.nan
-    innovation: Array = field(default_factory=lambda: np.full(6, np.nan))
-    innovation_sigma: Array = field(default_factory=lambda: np.full(6, np.nan))
+    innovation: Array = msgspec.field(default_factory=lambda: np.full(6, np.nan))
+    innovation_sigma: Array = msgspec.field(default_factory=lambda: np.full(6, np.nan))
     hypothesis: int = 0
     margin: float = math.inf
     source: str = ""

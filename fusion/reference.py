@@ -122,7 +122,7 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self.position = self.position + 0.5 * dt * (velocity + self.velocity)
         self.face(_turned(self.attitude, du[:3]))
 
-    def spread(self, gyro_walk: float, accel_walk: float) -> None:
+    def spread(self, measured: bool, gyro_walk: float, accel_walk: float) -> None:
         """Bring P up to the nominal state, the biases walking with such densities; see `kernels.spread`."""
         dt = self.lag
         if dt == 0.0:
@@ -132,9 +132,10 @@ class ErrorStateFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         added = start.T.dot(self.velocity - velocity + GRAVITY * dt * self.up)  # Δv, in start axes
         F, Q = _I.copy(), np.zeros((N, N))
         F[TH, TH] = F[DV, DV] = F[DP, DP] = A
-        F[TH, DBG] = F[DV, DBA] = -dt * A
-        F[DV, TH] = A.dot(skew(-added))
-        F[DV, DTILT] = -GRAVITY * dt * self.rotation.T.dot(self.up_by_tilt)
+        if measured:
+            F[TH, DBG] = F[DV, DBA] = -dt * A
+            F[DV, TH] = A.dot(skew(-added))
+            F[DV, DTILT] = -GRAVITY * dt * self.rotation.T.dot(self.up_by_tilt)
         F[DP, TH], F[DP, 9:] = 0.5 * dt * F[DV, TH], 0.5 * dt * F[DV, 9:]  # it goes by the mean of both velocities
         F[DP, DV] = dt * A
         angle, speed = self.white
@@ -632,6 +633,7 @@ class ReferenceTimeline:
                 t = reading[0]
             dt = t - state.t
             if state.bridging:
+                self._settle(state)
                 dt = min(dt, k.MOST_BRIDGED)
             if dt > 0.0:
                 part = 1.0
@@ -672,7 +674,7 @@ class ReferenceTimeline:
             rate_noise = p.wheel_rate_sigma / math.sqrt(k.GRID_HZ) if turns else p.no_imu_rate_noise
             force = GRAVITY * f.rotation.T @ f.up
             f.move(f.bias + np.concatenate([rate, force]), dt, rate_noise, 0.0)
-            f.spread(p.gyro_bias_walk, p.accel_bias_walk)
+            f.spread(False, p.gyro_bias_walk, p.accel_bias_walk)
             f.slow(dt, p.no_imu_accel_noise)
             return
         shaken = math.sqrt(state.change_accel / 6.0 * min(state.next_t - state.t_imu, p.imu_gap))
@@ -682,9 +684,9 @@ class ReferenceTimeline:
         f.move(u, dt, *white)
 
     def _settle(self, state: _State) -> None:
-        """Bring the covariances up to t, for whatever reads or changes them."""
+        """Bring the covariances up to t by what the IMU has said, for whatever reads or changes them."""
         for f in state.filters:
-            f.spread(self._params.gyro_bias_walk, self._params.accel_bias_walk)
+            f.spread(True, self._params.gyro_bias_walk, self._params.accel_bias_walk)
 
     # --- measurements
 

@@ -1,7 +1,7 @@
 """The service: one asyncio loop, one port, cameras and serial lines on threads of their own.
 
-Paths: WebSocket `/` (the original tracker's stream), `/v1/poses`, `/v1/robot`; GET `/` and `/phone` (pages),
-`/healthz`. Who may use them is in `server.access`.
+Its WebSockets: `/` (the original tracker's stream), `/v1/poses`, `/v1/robot`, `/v1/camera`. Before them stands
+`server.door`, with the pages and `/healthz`; what each connection may is in `server.visitor`.
 """
 
 from __future__ import annotations
@@ -16,34 +16,31 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable, Collection, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from importlib.resources import files
 from types import TracebackType
-from typing import Any, Self, TypeVar, get_args
+from typing import Any, Self, get_args
 from urllib.parse import parse_qsl, urlsplit
 
-import msgspec
 from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
-from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
-from websockets.http11 import Request, Response
 
-from fusion.localiser import warm_up
 from fusion.measurements import Pose
 from fusion.params import Channel
 from imu.protocols.detection import Detector, open_parser
 from imu.uart import SerialImu
-from server.access import bearer, is_local, is_loopback, origin_allowed, tls, token_matches
+from server.access import bearer, is_loopback, tls
 from server.camera_messages import camera_hello
 from server.cameras import FIRST_PAUSE, LONGEST_PAUSE, Camera, Open, Seen, open_configured
 from server.clock_questions import ClockQuestions
+from server.compiling import NOTICE, PATIENCE, load_or_compile
 from server.config import CameraConfig, Config
+from server.door import Door
 from server.hub import STALL_LIMIT, Hub, Subscription, Topic
-from server.listening import cannot_listen, response
+from server.listening import cannot_listen
 from server.messages import (
     FORMATS,
     ClockAnswer,
@@ -60,29 +57,19 @@ from server.messages import (
 )
 from server.remote_cameras import RemoteCamera
 from server.robots import Recording, Robot
+from server.visitor import RefusedError, Visitor, for_log
 
 log = logging.getLogger("steadfix")
 
 SERVICE = f"steadfix {version('steadfix')}"
 # A batch of 200 samples in full precision is 30 KiB.
 MAX_MESSAGE = 64 * 1024
-# Bytes a second that a connection may send, each message counting for so many more, and the seconds that it may have
-# been silent to send more at once. An IMU of 1 kHz that sends each sample alone needs a third.
-BYTES_PER_SECOND = 2_000_000
-MESSAGE_COST = 500
-SAVED_UP = 5.0
-# Connections at a time.
-MAX_CONNECTIONS = 500
-# s before one who showed a wrong token is told, so that nobody can try many.
-WRONG_TOKEN_PAUSE = 1.0
 # The original stream; a robot's poses are ("own", its name), as it speaks, or (channel, its name, format), for viewers.
 TRACKER: Topic = ("tracker",)
 # Bytes of the original stream that may wait for a client: there each message counts, so some may.
 TRACKER_ROOM = 64 * 1024
 # s without a word after which a robot's connection is taken for dead, and another may take its place.
 SILENCE = 3.0
-# s until a robot must have said who it is.
-HELLO_TIMEOUT = 10.0
 # s between two rounds of diagnoses; and their share of the loop's time within one, since each takes some milliseconds.
 DIAGNOSE_EVERY, DIAGNOSE_SHARE = 5.0, 0.05
 # s that a camera waits for the filters' word; without it, it looks where the markers were last.
@@ -90,26 +77,6 @@ POSES_TIMEOUT = 0.05
 # s that closing may take: for clients that do not answer, and for threads that hang in a driver.
 CLOSE_TIMEOUT = 0.7
 
-_PAGE = {
-    "/": ("index.html", "text/html; charset=utf-8"),
-    "/dashboard.css": ("dashboard.css", "text/css; charset=utf-8"),
-    "/dashboard.js": ("dashboard.js", "text/javascript; charset=utf-8"),
-    "/favicon.svg": ("favicon.svg", "image/svg+xml"),
-    "/phone": ("phone.html", "text/html; charset=utf-8"),
-    "/phone.css": ("phone.css", "text/css; charset=utf-8"),
-    "/phone.js": ("phone.js", "text/javascript; charset=utf-8"),
-}
-_WEBSOCKETS = ("/", "/v1/poses", "/v1/robot", "/v1/camera")
-_THERE_IS = (
-    "There is:\n"
-    "  GET        /           the page that shows the robots\n"
-    "  GET        /phone      the page that makes a phone an IMU\n"
-    "  GET        /healthz    health, as JSON\n"
-    "  WebSocket  /v1/poses   poses; ?robots=a,b&rate=50&channel=best&format=msgpack\n"
-    "  WebSocket  /v1/robot   for a robot: IMU up, its pose down\n"
-    "  WebSocket  /v1/camera  for the node of a remote camera, `steadfix camera`\n"
-    "  WebSocket  /           marker sightings, as the original tracker sent them\n"
-)
 _MODES = {
     "INIT": "no fix yet",
     "COAST": "no fix for a while, the IMU alone",
@@ -120,66 +87,11 @@ _MODES = {
 }
 
 
-T = TypeVar("T")
-
-
-class RefusedError(Exception):
-    """A client that cannot be served. The text is what it is told before its connection is closed.
-
-    `retry`: whether the same may work later.
-    """
-
-    def __init__(self, reason: str, retry: bool = False) -> None:
-        super().__init__(reason)
-        self.retry = retry
-
-
-class _Visitor:
-    """One connection: who it is, how it speaks, what it may still send, and what it was refused."""
-
-    def __init__(self, connection: ServerConnection, path: str) -> None:
-        assert connection.request is not None
-        self.connection = connection
-        self.name = f"{path} from {_address(connection)}"
-        self.headers = _lower(connection.request.headers)
-        self.local = is_local(_host(connection), self.headers)
-        self.dialect = Dialect()
-        self.refused = 0
-        self._credit = BYTES_PER_SECOND * SAVED_UP
-        self._credited = time.monotonic()
-        self._told = False
-
-    async def receive(self) -> str | bytes:
-        """Its next message. One that sends too much is not read for a while. Raises ConnectionClosed."""
-        if self._credit < 0.0:
-            if not self._told:
-                self._told = True
-                text = f"more than {BYTES_PER_SECOND / 1e3:.0f} kB a second come, each message counting as "
-                text += f"{MESSAGE_COST} bytes more: they have to wait"
-                log.warning("%s: %s", self.name, text)
-                self.tell_now(Notice(text))
-            await asyncio.sleep(-self._credit / BYTES_PER_SECOND)
-        data = await self.connection.recv()
-        now = time.monotonic()
-        earned = (now - self._credited) * BYTES_PER_SECOND
-        self._credit = min(self._credit + earned, BYTES_PER_SECOND * SAVED_UP) - len(data) - MESSAGE_COST
-        self._credited = now
-        return data
-
-    async def tell(self, message: msgspec.Struct) -> None:
-        """Waits until the client takes it."""
-        await self.connection.send(self.dialect.encode(message), text=not self.dialect.binary)
-
-    def tell_now(self, message: msgspec.Struct) -> None:
-        """Into its buffer."""
-        broadcast([self.connection], self.dialect.encode(message), text=not self.dialect.binary)
-
-
 @dataclass(eq=False)
 class _Link:
     """A robot's connection."""
 
-    visitor: _Visitor
+    visitor: Visitor
     heard: float
     questions: ClockQuestions = field(default_factory=ClockQuestions)
 
@@ -202,17 +114,15 @@ class Service:
         self.hub = Hub(tick=1.0 / config.server.pose_rate_hz)
         self.robots = {robot.name: Robot(robot, recording) for robot in config.robot}
         self.cameras = {camera.name: self._camera(camera, open_camera) for camera in config.camera}
-        self.refused = 0
         self.port = 0
         # Set once the filters' kernels are compiled; what comes before is not fed.
         self.ready = asyncio.Event()
+        self._visitors: set[Visitor] = set()
+        self._refused = 0  # of visitors that have gone, and besides single messages
         self._links: dict[str, _Link] = {}
         self._started = time.monotonic()
         self._published = published
-        self._page = {
-            path: (files("server").joinpath("dashboard", name).read_bytes(), kind)
-            for path, (name, kind) in _PAGE.items()
-        }
+        self._door = Door(config.server, self.health, lambda: len(self._visitors))
         self._loop = asyncio.get_running_loop()
         self._server: Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
@@ -225,7 +135,7 @@ class Service:
                 self._serve,
                 host,
                 port,
-                process_request=self._answer,
+                process_request=self._door.answer,
                 ssl=tls(self.config.server.certificate, self.config.server.key),
                 compression=None,
                 max_size=MAX_MESSAGE,
@@ -302,7 +212,7 @@ class Service:
         def work() -> None:
             try:
                 for engine in sorted({robot.config.engine for robot in self.robots.values()}):
-                    warm_up(engine)
+                    load_or_compile(engine)
             except Exception as error:
                 self._call_from_thread(end, error)
             else:
@@ -310,10 +220,7 @@ class Service:
 
         # A daemon, unlike the threads of asyncio: compiling must not keep the service from ending.
         threading.Thread(target=work, name="warm-up", daemon=True).start()
-        # Loading takes a moment, compiling a while: only that needs an explanation.
-        notice = self._loop.call_later(
-            3.0, log.info, "compiling the filters; this happens once after each update and may take a minute"
-        )
+        notice = self._loop.call_later(PATIENCE, log.info, NOTICE)
         try:
             await asyncio.shield(warm)
         finally:
@@ -473,6 +380,11 @@ class Service:
         if (link := self._links.get(name)) is not None:
             link.visitor.tell_now(Notice(text))
 
+    @property
+    def refused(self) -> int:
+        """Messages and connections that could not be used."""
+        return self._refused + sum(visitor.refused for visitor in self._visitors)
+
     def health(self) -> dict[str, Any]:
         now = time.monotonic()
         # Asked before it is compiled, a filter would compile here and now.
@@ -511,64 +423,13 @@ class Service:
             ],
         }
 
-    # HTTP
-
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answers what is no WebSocket; None lets a WebSocket in."""
-        try:
-            path = urlsplit(request.path).path
-        except ValueError:
-            return _text(400, f"This is no path: {request.path}\n{_THERE_IS}", request)
-        headers = _lower(request.headers)
-        local = is_local(_host(connection), headers)
-        if headers.get("upgrade", "").lower() == "websocket":
-            if path not in _WEBSOCKETS:
-                return _text(404, f"No WebSocket at {path}\n{_THERE_IS}", request)
-            return self._door(path, headers, local, request)
-        if request.method not in ("GET", "HEAD"):
-            return _text(405, f"{request.method} is not possible here.\n{_THERE_IS}", request)
-        if path == "/healthz":
-            if not local and not self._is_viewer(bearer(headers)):
-                return self._locked(request)
-            return response(200, msgspec.json.encode(self.health()) + b"\n", "application/json", request)
-        if path in self._page:
-            return response(200, *self._page[path], request)
-        if path in _WEBSOCKETS:
-            return _text(426, f"{path} is a WebSocket.\n{_THERE_IS}", request)
-        return _text(404, f"Nothing at {path}\n{_THERE_IS}", request)
-
-    def _door(self, path: str, headers: Mapping[str, str], local: bool, request: Request) -> Response | None:
-        """What keeps a WebSocket out before it has said anything; None lets it in."""
-        assert self._server is not None
-        if len(self._server.connections) >= MAX_CONNECTIONS:
-            return _text(503, f"{MAX_CONNECTIONS} connections are open, and no more are taken.\n", request)
-        if path == "/":
-            # As open as the original was, unless those who look on need a token.
-            if self.config.server.token and not local and not self._is_viewer(bearer(headers)):
-                return self._locked(request)
-        elif not origin_allowed(headers, local, self.config.server.origins):
-            origin = headers["origin"]
-            log.warning("%s: a page of %s was kept out; `origins` under [server] lets it in", path, _for_log(origin))
-            return _text(
-                403, f"Pages of {origin} are not let in; needed: `origins` under [server] names it.\n", request
-            )
-        return None
-
-    def _is_viewer(self, token: str) -> bool:
-        return bool(self.config.server.token) and token_matches(token, self.config.server.token)
-
-    def _locked(self, request: Request) -> Response:
-        if not self.config.server.token:
-            text = "[server] has no token in the configuration, and without one only this machine is shown anything.\n"
-            return _text(403, text, request)
-        return _text(401, "This needs the token of [server], as `Authorization: Bearer <token>`.\n", request)
-
     # WebSockets
 
     async def _serve(self, connection: ServerConnection) -> None:
         assert connection.request is not None
         url = urlsplit(connection.request.path)
-        visitor = _Visitor(connection, url.path)
+        visitor = Visitor(connection, url.path)
+        self._visitors.add(visitor)
         try:
             if url.path == "/v1/robot":
                 await self._serve_robot(visitor)
@@ -579,8 +440,8 @@ class Service:
             else:
                 await self._serve_tracker(visitor)
         except RefusedError as error:
-            self.refused += 1
-            log.warning("%s was refused: %s", visitor.name, _for_log(str(error)))
+            self._refused += 1
+            log.warning("%s was refused: %s", visitor.name, for_log(str(error)))
             with contextlib.suppress(ConnectionClosed):
                 await visitor.tell(Error(str(error), error.retry))
                 # A close frame holds 123 bytes of reason.
@@ -588,45 +449,25 @@ class Service:
                 await connection.close(code, str(error).encode()[:120].decode(errors="ignore"))
         except ConnectionClosed as error:
             if error.sent is not None and error.sent.code == CloseCode.MESSAGE_TOO_BIG:
-                self.refused += 1
+                self._refused += 1
                 log.warning("%s sent a message of more than %d bytes and was closed", visitor.name, MAX_MESSAGE)
         finally:
+            self._visitors.remove(visitor)
+            self._refused += visitor.refused
             if visitor.refused > 1:
                 log.warning("%s: %d messages were refused in all", visitor.name, visitor.refused)
 
-    async def _refuse(self, visitor: _Visitor, error: MessageError) -> None:
-        """Tell a client what was wrong with its message. It waits until the client takes that, so none can flood."""
-        self.refused += 1
-        visitor.refused += 1
-        if visitor.refused == 1:
-            log.warning("%s sent a message that cannot be used: %s", visitor.name, _for_log(str(error)))
-        await visitor.tell(Error(str(error)))
-
-    async def _admit(self, visitor: _Visitor, token: str, configured: str, whose: str) -> None:
-        """Let in who shows the configured token, and from this machine, where none is configured, anybody."""
-        if not configured:
-            if visitor.local:
-                return
-            raise RefusedError(
-                f"{whose} has no token in the configuration, and without one only this machine is served"
-            )
-        if not token:
-            raise RefusedError(f'{whose} needs its token: "token" in the hello, or `Authorization: Bearer <token>`')
-        if not token_matches(token, configured):
-            await asyncio.sleep(WRONG_TOKEN_PAUSE)
-            raise RefusedError(f"this is not the token of {whose}")
-
-    async def _serve_tracker(self, visitor: _Visitor) -> None:
+    async def _serve_tracker(self, visitor: Visitor) -> None:
         with self._client(visitor, [TRACKER], room=TRACKER_ROOM):
             while True:
                 await visitor.receive()  # the original ignored what its clients sent
 
-    async def _serve_poses(self, visitor: _Visitor, query: str) -> None:
+    async def _serve_poses(self, visitor: Visitor, query: str) -> None:
         token = bearer(visitor.headers)
         if not visitor.local:
             if not token and self.config.server.token:
-                token = (await self._hello(visitor, decode_watch)).token
-            await self._admit(visitor, token, self.config.server.token, "[server]")
+                token = (await visitor.hello(decode_watch)).token
+            await visitor.admit(token, self.config.server.token, "[server]")
         robots, rate_hz, channel, format = self._poses_query(query)
         visitor.dialect = Dialect(binary=format == "msgpack")
         with self._client(visitor, [(channel, robot, format) for robot in robots], rate_hz):
@@ -635,7 +476,7 @@ class Service:
                 with contextlib.suppress(MessageError):
                     decode_watch(data)  # a page says its token wherever it is
                     continue
-                await self._refuse(visitor, MessageError("/v1/poses only sends; robots speak on /v1/robot"))
+                await visitor.refuse(MessageError("/v1/poses only sends; robots speak on /v1/robot"))
 
     def _poses_query(self, query: str) -> tuple[list[str], float, str, str]:
         robots, rate_hz, channel, format = list(self.robots), self.config.server.pose_rate_hz, "smooth", "json"
@@ -671,7 +512,7 @@ class Service:
         return self.robots[name]
 
     def _client(
-        self, visitor: _Visitor, topics: Collection[Topic], rate_hz: float = 0.0, room: int = 0
+        self, visitor: Visitor, topics: Collection[Topic], rate_hz: float = 0.0, room: int = 0
     ) -> AbstractContextManager[Subscription]:
         connection, text = visitor.connection, not visitor.dialect.binary
         transport = connection.transport
@@ -687,34 +528,32 @@ class Service:
             room,
         )
 
-    async def _serve_camera(self, visitor: _Visitor) -> None:
-        hello = await self._hello(visitor, camera_hello)
+    async def _serve_camera(self, visitor: Visitor) -> None:
+        hello = await visitor.hello(camera_hello)
         token = hello.token or bearer(visitor.headers)
         camera = self.cameras.get(hello.camera)
         if camera is None and not visitor.local:
-            await self._admit(visitor, token, secrets.token_hex(), f'camera "{hello.camera}"')
+            await visitor.admit(token, secrets.token_hex(), f'camera "{hello.camera}"')
         if not isinstance(camera, RemoteCamera):
             known = ", ".join(name for name, camera in self.cameras.items() if isinstance(camera, RemoteCamera))
             raise RefusedError(
                 f'there is no remote camera "{hello.camera}" in the configuration (source = "remote"); '
                 f"known: {known or 'none'}"
             )
-        await self._admit(visitor, token, camera.config.token, f'camera "{hello.camera}"')
+        await visitor.admit(token, camera.config.token, f'camera "{hello.camera}"')
         if taken := camera.refusal(time.monotonic()):
             raise RefusedError(taken, retry=True)
-        address = _address(visitor.connection)
-        refuse = functools.partial(self._refuse, visitor)
-        await camera.serve(visitor.connection, address, SERVICE, visitor.receive, refuse)
+        await camera.serve(visitor.connection, visitor.address, SERVICE, visitor.receive, visitor.refuse)
 
-    async def _serve_robot(self, visitor: _Visitor) -> None:
-        hello = await self._hello(visitor, decode_hello)
+    async def _serve_robot(self, visitor: Visitor) -> None:
+        hello = await visitor.hello(decode_hello)
         visitor.dialect = Dialect(hello, visitor.dialect.binary)
         token = hello.token or bearer(visitor.headers)
         if hello.robot in self.robots or visitor.local:
             configured = self._known(hello.robot).config.token
         else:
             configured = secrets.token_hex()  # which names there are is not told to everybody
-        await self._admit(visitor, token, configured, f'robot "{hello.robot}"')
+        await visitor.admit(token, configured, f'robot "{hello.robot}"')
         robot = self._known(hello.robot)
         if robot.config.imu.source != "websocket":
             raise RefusedError(f'the IMU of "{hello.robot}" is on {robot.config.imu.source}, by the configuration')
@@ -733,7 +572,7 @@ class Service:
                         self._hear(robot, link, data, arrival)
                     except MessageError as error:
                         robot.dropped += 1
-                        await self._refuse(visitor, error)
+                        await visitor.refuse(error)
                     else:
                         self._answer_robot(robot, link, subscription)
         finally:
@@ -744,33 +583,15 @@ class Service:
                 if self._server is not None and self._server.is_serving():
                     log.info("robot %s has gone", hello.robot)
 
-    async def _hello(self, visitor: _Visitor, decode: Callable[[str | bytes], T]) -> T:
-        """The first message, which says who it is; anything else is answered and waited past."""
-        try:
-            async with asyncio.timeout(HELLO_TIMEOUT):
-                while True:
-                    data = await visitor.receive()
-                    # One who sends JSON as binary is to read the answer.
-                    visitor.dialect = Dialect(binary=isinstance(data, bytes) and data[:1] != b"{")
-                    try:
-                        return decode(data)
-                    except MessageError as error:
-                        await self._refuse(visitor, error)
-        except TimeoutError:
-            # It may not even read: no last word for it.
-            visitor.connection.transport.abort()
-            raise RefusedError(f"it has not said hello for {HELLO_TIMEOUT:.0f} s") from None
-
-    def _take(self, robot: Robot, visitor: _Visitor) -> _Link:
+    def _take(self, robot: Robot, visitor: Visitor) -> _Link:
         """Make this the robot's connection. One that has been silent, as after a lost link, gives way."""
         name, now = robot.config.name, time.monotonic()
         before = self._links.get(name)
         if before is not None:
-            other = before.visitor.connection
             if now - before.heard < SILENCE:
-                raise RefusedError(f'robot "{name}" is already connected, from {_address(other)}', retry=True)
+                raise RefusedError(f'robot "{name}" is already connected, from {before.visitor.address}', retry=True)
             log.info("robot %s has connected anew; its old connection was silent", name)
-            other.transport.abort()
+            before.visitor.connection.transport.abort()
         link = self._links[name] = _Link(visitor, now)
         robot.connected()
         return link
@@ -798,7 +619,7 @@ class Service:
     def _answer_robot(self, robot: Robot, link: _Link, subscription: Subscription) -> None:
         """Its pose at once, with what it just sent in it, as far as the rate that it asked for allows."""
         now = time.monotonic()
-        if subscription.topics and self.ready.is_set() and subscription.is_due(now, early=subscription.interval):
+        if subscription.topics and self.ready.is_set() and self.hub.is_due(now, subscription, answer=True):
             pose = self._pose(robot, now)
             if pose is not None:
                 self.hub.send(now, subscription, robot.encode_own(pose, now, link.visitor.dialect))
@@ -810,27 +631,3 @@ class Service:
             if visitor.connection.transport.get_write_buffer_size() == 0:
                 visitor.tell_now(questions.ask(time.monotonic()))
             await asyncio.sleep(questions.pause)
-
-
-def _for_log(text: str) -> str:
-    """In one line of bearable length: what a client sent is quoted in it."""
-    text = text if len(text) <= 300 else text[:297] + "..."
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-
-
-def _lower(headers: Headers) -> dict[str, str]:
-    return {name.lower(): value for name, value in headers.raw_items()}
-
-
-def _host(connection: ServerConnection) -> str:
-    address = connection.remote_address
-    return str(address[0]) if isinstance(address, tuple) else ""
-
-
-def _address(connection: ServerConnection) -> str:
-    address = connection.remote_address
-    return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)
-
-
-def _text(status: int, text: str, request: Request) -> Response:
-    return response(status, text.encode(), "text/plain; charset=utf-8", request)

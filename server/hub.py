@@ -32,11 +32,6 @@ class Subscription:
     due: float = 0.0
     stalled_since: float | None = None
 
-    def is_due(self, now: float, early: float) -> bool:
-        """Whether a message may go out now, or so many s ahead of its time; the next one is then due as if it had
-        been sent on time, so that the rate stays what it is."""
-        return now >= self.due - early
-
     def sent(self, now: float) -> None:
         """A message has gone out."""
         # On schedule, so that 25 Hz out of 60 Hz is 25 Hz on average; but no catching up after a pause.
@@ -75,15 +70,20 @@ class Hub:
     def wants(self, topic: Topic) -> bool:
         return any(topic in subscription.topics for subscription in self.subscriptions)
 
+    def is_due(self, now: float, subscription: Subscription, *, answer: bool = False) -> bool:
+        """Whether a message may go out. `answer`: to what just came, ahead of its time by up to one interval; the next
+        one is then due as if it had been sent on time, so that the rate stays what it is."""
+        # Else at the nearest tick: one who wants every tick, and had to be due to the millisecond, would miss the next
+        # one after each that is late.
+        early = 0.5 * self.tick + (subscription.interval if answer else 0.0)
+        return now >= subscription.due - early
+
     def publish(self, now: float, message: Callable[[Topic], bytes | None]) -> None:
         """`message`: what there is of a topic, encoded. It is asked once for each that a client is due for; what a
         client gets in one call counts as one for its rate."""
         messages: dict[Topic, bytes | None] = {}
-        # At the nearest tick: one who wants every tick, and had to be due to the millisecond, would miss the next one
-        # after each that is late.
-        early = 0.5 * self.tick
         for subscription in self.subscriptions:
-            if not subscription.is_due(now, early):
+            if not self.is_due(now, subscription):
                 continue
             for topic in subscription.topics:
                 if topic not in messages:

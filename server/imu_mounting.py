@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from fusion.geometry import exp_so3, rotation_about_z
-from fusion.localiser import Localiser, warm_up
+from fusion.localiser import Localiser
 from fusion.measurements import Array
 from fusion.params import GRAVITY, FilterParams
 from imu.calibration import CalibrationError, check_gravity
 from imu.mounting import BodyReadings, ImuCalibration, deg_from_rotation, rotation_from_deg, toml_lines
+from server.compiling import compile_filter
 from server.recording import Recording, load, load_calibration, robot_folders
 from server.replay import replay
 
@@ -125,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
         raise CalibrationError(f"{args.recording}: several robots; name one of {names}")
     known = load_calibration(folders[0])
     raw = load(folders[0], calibration=ImuCalibration())
-    warm_up()
+    compile_filter()
     with tqdm(unit=" replays", delay=1.0, leave=False, disable=None) as bar:
         found = find(raw, known, bar.update)
     worst = float(found.sigma_deg.max())

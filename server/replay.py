@@ -6,7 +6,6 @@ import argparse
 import json
 import math
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any, get_args
@@ -16,11 +15,12 @@ from tqdm import tqdm
 
 from fusion.consistency import hold_last, track_error
 from fusion.health import Health
-from fusion.localiser import Localiser, warm_up
+from fusion.localiser import Localiser
 from fusion.measurements import Array, FixOutcome, Outcome, PoseFix, WheelOdometry
 from fusion.params import Channel, Engine, FilterParams, Motion
 from imu.mounting import ImuCalibration
 from server import config
+from server.compiling import compile_filter
 from server.recording import Recording, RecordingError, load, robot_folders, write_tum
 
 # s of the recording between two diagnoses: what is wrong in between only is to be told too.
@@ -212,23 +212,6 @@ def _settings(args: argparse.Namespace, name: str) -> tuple[FilterParams, Motion
     return config.with_settings(params, args.set), args.motion or motion, args.engine or engine, imu
 
 
-def _compile() -> None:
-    """`warm_up` on a thread of its own: here a Ctrl-C could fall into a callback of the compiler, which swallows it."""
-    errors: list[Exception] = []
-
-    def work() -> None:
-        try:
-            warm_up()
-        except Exception as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=work, name="warm-up", daemon=True)
-    thread.start()
-    thread.join()
-    if errors:
-        raise errors[0]
-
-
 def run(args: argparse.Namespace) -> int:
     """Replay, print, write. -> exit status."""
     folders = robot_folders(args.recording)
@@ -247,7 +230,7 @@ def run(args: argparse.Namespace) -> int:
             failed = True
             continue
         if engine == "numba":
-            _compile()
+            compile_filter()
         health = Health(Localiser(recording.name, params, motion, engine), args.channel)
         with tqdm(
             total=len(recording.samples), unit=" samples", delay=1.0, leave=False, disable=not sys.stderr.isatty()

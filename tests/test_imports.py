@@ -26,6 +26,8 @@ DOORS = {
         "server/listening.py",
         "server/calibration_page.py",
         "server/app.py",
+        "server/door.py",
+        "server/visitor.py",
         "server/connecting.py",
         "server/robot_client.py",
         "server/remote_cameras.py",

@@ -60,7 +60,7 @@ def error(s, other, fix=False):
 def predict(s, dt, noise=(0.0, 0.0, 0.0, 0.0)):
     out = s.copy()
     k.predict(out[: k.BLOCK], *INPUT, dt, *noise[:2])
-    k.spread(out[: k.BLOCK], *noise[2:])
+    k.spread(out[: k.BLOCK], k.MEASURED, *noise[2:])
     return out
 
 
@@ -125,8 +125,8 @@ def test_the_covariance_of_several_samples_at_once_is_that_of_each_to_second_ord
         for u in inputs:
             for out in (each, once):
                 k.predict(out[: k.BLOCK], *u, dt, 1e-2, 3e-2)
-            k.spread(each[: k.BLOCK], 1e-3, 4e-3)
-        k.spread(once[: k.BLOCK], 1e-3, 4e-3)
+            k.spread(each[: k.BLOCK], k.MEASURED, 1e-3, 4e-3)
+        k.spread(once[: k.BLOCK], k.MEASURED, 1e-3, 4e-3)
         np.testing.assert_array_equal(once[: k.COV], each[: k.COV])
         assert once[k.LAG] == once[k.ANGLE_VARIANCE] == once[k.VELOCITY_VARIANCE] == 0.0
         P, Q = (state[k.COV : k.COV + k.N * k.N] for state in (once, each))
@@ -292,21 +292,17 @@ def slowed(s, dt, noise, steps=1):
         up = np.array([*out[k.TILT : k.TILT + 2], np.sqrt(1.0 - np.sum(out[k.TILT : k.TILT + 2] ** 2))])
         gyro, accel = out[k.BG : k.BG + 3], out[k.BA : k.BA + 3] + GRAVITY * R.T @ up
         k.predict(out[: k.BLOCK], *gyro, *accel, dt / steps, 0.0, 0.0)
-        k.spread(out[: k.BLOCK], 0.0, 0.0)
+        k.spread(out[: k.BLOCK], k.BRIDGED, 0.0, 0.0)
         k._slow(out[: k.BLOCK], dt / steps, noise)
     return out
 
 
 def test_a_speed_decays_the_same_in_one_step_or_many():
     s = some_state(np.random.default_rng(9))
-    # A covariance without what the attitude and biases would add, which spread knows of a step at a time.
-    P = np.zeros((k.N, k.N))
-    A = np.random.default_rng(10).normal(0.0, 0.1, (6, 6))
-    P[3:9, 3:9] = A @ A.T
-    s[k.COV : k.COV + k.N * k.N] = P.ravel()
+    s[k.COV : k.COV + k.N * k.N] = some_covariance(np.random.default_rng(10)).ravel()
     once, often = slowed(s, 1.7, 0.8), slowed(s, 1.7, 0.8, 500)
     np.testing.assert_allclose(once[: k.COV], often[: k.COV], atol=1e-10)
-    P, Q = (state[k.COV : k.COV + k.N * k.N].reshape(k.N, k.N)[3:9, 3:9] for state in (once, often))
+    P, Q = (state[k.COV : k.COV + k.N * k.N] for state in (once, often))
     np.testing.assert_allclose(P, Q, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(once[k.V : k.V + 3], s[k.V : k.V + 3] * np.exp(-1.7 / k.COAST_TIME), rtol=1e-12)
 

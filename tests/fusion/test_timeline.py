@@ -210,6 +210,18 @@ def test_without_imu_fixes_alone_still_make_a_pose():
     assert np.linalg.norm(pose.position - circle.pose(7.8)[0]) < 0.1
 
 
+def test_the_past_within_a_pause_is_bridged_from_its_start():
+    """As the filter has come through it itself, once a fix beyond the pause has shown that it is one."""
+    rng = np.random.default_rng(7)
+    localiser = Localiser("rover", FilterParams(), "free")
+    localiser.feed(circle.fix(0.005, rng=rng))
+    localiser.feed(ImuBatch("rover", 0.0, circle.imu(np.arange(0.0, 1.001, 0.01), rng)))
+    localiser.feed(circle.fix(1.6, rng=rng))
+    at_pause, within = localiser.pose_at(1.0), localiser.pose_at(1.3)
+    way = k.COAST_TIME * (1.0 - np.exp(-0.3 / k.COAST_TIME)) * at_pause.velocity
+    np.testing.assert_allclose(within.position - at_pause.position, way, atol=1e-9)
+
+
 @pytest.mark.parametrize("capacity", ["IMU_CAPACITY", "FIX_CAPACITY"])
 def test_full_rings_forget_the_oldest_and_go_on(capacity):
     localiser = Localiser("rover", FilterParams(), "ground")

@@ -31,7 +31,7 @@ ELSEWHERE = {"X-Forwarded-For": "192.0.2.7"}
 
 @pytest.fixture(autouse=True)
 def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.app.WRONG_TOKEN_PAUSE", 0.01)
+    monkeypatch.setattr("server.visitor.WRONG_TOKEN_PAUSE", 0.01)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def test_json_in_a_binary_message_is_answered_in_json() -> None:
 
 
 def test_many_tokens_are_not_tried_in_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.app.WRONG_TOKEN_PAUSE", 0.3)
+    monkeypatch.setattr("server.visitor.WRONG_TOKEN_PAUSE", 0.3)
 
     async def main() -> None:
         async with serving(TOKENS) as service, client(service, "/v1/robot") as connection:
@@ -283,8 +283,8 @@ def test_a_page_of_another_address_is_kept_out() -> None:
 def test_a_flood_is_made_to_wait_and_the_others_are_not(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("server.app.BYTES_PER_SECOND", 50_000)
-    monkeypatch.setattr("server.app.SAVED_UP", 0.5)
+    monkeypatch.setattr("server.visitor.BYTES_PER_SECOND", 50_000)
+    monkeypatch.setattr("server.visitor.SAVED_UP", 0.5)
 
     async def main() -> None:
         async with (
@@ -311,7 +311,7 @@ def test_a_flood_is_made_to_wait_and_the_others_are_not(
 
 
 def test_no_more_connections_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.app.MAX_CONNECTIONS", 2)
+    monkeypatch.setattr("server.door.MAX_CONNECTIONS", 2)
 
     async def main() -> None:
         async with serving() as service, client(service, "/v1/poses"):

@@ -354,7 +354,7 @@ def test_before_the_hello_nothing_else_is_heard() -> None:
 
 
 def test_one_that_never_says_hello(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.app.HELLO_TIMEOUT", 0.1)
+    monkeypatch.setattr("server.visitor.HELLO_TIMEOUT", 0.1)
 
     async def main() -> None:
         async with serving() as service, client(service, "/v1/robot") as connection:

@@ -251,12 +251,14 @@ def test_the_smooth_channel_is_written_too(recorded, tmp_path, capsys):
     assert steps["best"] > 2.0 * steps["smooth"]
 
 
-def test_ctrl_c_while_the_filter_is_compiled(tmp_path, monkeypatch):
-    monkeypatch.setattr("server.replay.warm_up", lambda: time.sleep(30.0))
+def test_ctrl_c_while_the_filter_is_compiled(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("server.compiling.load_or_compile", lambda: time.sleep(30.0))
+    monkeypatch.setattr("server.compiling.PATIENCE", 0.1)
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
     began = time.monotonic()
     assert main(["replay", str(plain(tmp_path / "drive"))]) == 130
     assert time.monotonic() - began < 10.0
+    assert "compiling the filters" in capsys.readouterr().err
 
 
 def test_a_folder_of_robots(recorded, tmp_path, capsys):

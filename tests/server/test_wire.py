@@ -267,19 +267,23 @@ def test_ticks_that_are_late_now_and_then_cost_nobody_a_message() -> None:
     assert min(len(client.received) for client in clients) >= 499
 
 
-def test_an_early_answer_does_not_change_the_rate() -> None:
-    hub = Hub(tick=0.01)
+@pytest.mark.parametrize("tick", [0.01, 0.02])
+@pytest.mark.parametrize("phase", [3, 17, 32, 46])
+@pytest.mark.parametrize("due", [0, 4, 9, 13])
+def test_an_early_answer_does_not_change_the_rate(tick: float, phase: int, due: int) -> None:
+    hub = Hub(tick)
     client = Client(hub, A, rate_hz=50.0)
-    # 20 batches a second, each answered at once; the tick of 100 Hz sends what is due in between.
+    client.subscription.due = 100.0 + 1e-3 * due
+    # 20 batches a second, each answered at once; ticks send what is due in between.
     answered = 0
     for i in range(1, 10_001):
         now = 100.0 + i * 1e-3
-        if i % 50 == 17:
-            assert client.subscription.is_due(now, early=client.subscription.interval)
+        if i % 50 == phase:
+            assert hub.is_due(now, client.subscription, answer=True)
             hub.send(now, client.subscription, b"early")
             assert client.received[-1] == b"early"
             answered += 1
-        if i % 10 == 0:
+        if i % round(1e3 * tick) == 0:
             hub.publish(now, about(a=b"A"))
     assert answered == 200
     assert len(client.received) == pytest.approx(500, abs=2)
@@ -290,7 +294,7 @@ def test_more_batches_than_poses_are_not_all_answered() -> None:
     client = Client(hub, A, rate_hz=20.0)
     for i in range(2000):
         now = 100.0 + i * 0.005
-        if client.subscription.is_due(now, early=client.subscription.interval):
+        if hub.is_due(now, client.subscription, answer=True):
             hub.send(now, client.subscription, b"early")
     assert len(client.received) == pytest.approx(200, abs=2)
 

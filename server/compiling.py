@@ -1,0 +1,47 @@
+"""Compiling the filter, as fast as the machine can, and saying so."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from fusion import kernels
+from fusion.localiser import warm_up
+from fusion.params import Engine
+
+# Loading takes a moment, compiling a while: after so many s that needs an explanation.
+PATIENCE = 3.0
+NOTICE = "compiling the filters; this happens once after each update and may take a minute"
+
+
+def load_or_compile(engine: Engine = "numba") -> None:
+    """`warm_up`, with the help of a second interpreter, as numba compiles one thing at a time in each."""
+    index = f"{Path(kernels.__file__).stem}.{kernels.process.__name__}-*.nbi"
+    if engine == "numba" and (os.cpu_count() or 1) > 1 and not any(Path(kernels.process.stats.cache_path).glob(index)):
+        beside = [sys.executable, "-c", "from fusion import kernels; kernels.compile_moving()"]
+        with subprocess.Popen(beside, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
+            kernels.compile_taking()
+    warm_up(engine)
+
+
+def compile_filter() -> None:
+    """On a thread of its own: here a Ctrl-C could fall into a callback of the compiler, which swallows it."""
+    errors: list[Exception] = []
+
+    def work() -> None:
+        try:
+            load_or_compile()
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work, name="warm-up", daemon=True)
+    thread.start()
+    thread.join(PATIENCE)
+    if thread.is_alive():
+        print(f"steadfix: {NOTICE}", file=sys.stderr)
+    thread.join()
+    if errors:
+        raise errors[0]
