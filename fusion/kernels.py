@@ -902,6 +902,7 @@ def _judge(s, prm, fix):
     A fix of which only the attitude fails is taken with its position alone, and counts as a reject for the way back.
     """
     H, y, R, S = np.empty((6, N)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    shadow = MAIN + SHADOW  # as a variable: for each constant argument numba compiles a function of its own
     if s[TWINS] > 0.0:
         # Which of the first fix's poses was it? Both go on until that is clear, the likelier one as the filter.
         for o in range(MAIN, AUX, BLOCK):
@@ -917,7 +918,7 @@ def _judge(s, prm, fix):
             s[TWINS] = s[SHADOW_COUNT] = 0.0
         else:
             # the one that is the filter now takes the fix below
-            _weigh(s, SHADOW, prm, fix, H, y, R, S)
+            _weigh(s, shadow, prm, fix, H, y, R, S)
             if fix[F_D2] <= prm[GATE] * prm[GATE_INFLATION]:
                 update(s[SHADOW:AUX], H, y, R)
     shadows = s[SHADOW_COUNT] > 0.0 and s[TWINS] == 0.0
@@ -927,7 +928,7 @@ def _judge(s, prm, fix):
         _weigh(s, o, prm, fix, H, y, R, S)
         if max(s[COV], s[COV + N + 1], s[COV + 2 * (N + 1)]) > 2.0 * UNKNOWN_HEADING * UNKNOWN_HEADING:
             # After so long without an IMU nothing is left to weigh the fix by.
-            _start(s, MAIN, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, s[INITIALISED] == 0.0)
+            _start(s, o, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, s[INITIALISED] == 0.0)
             _restarted(s, prm, fix, 1.0)
             return
         blocks = max(fix[F_D2_POSITION], fix[F_D2_ATTITUDE]) / prm[GATE_BLOCK]
@@ -1022,7 +1023,7 @@ def _judge(s, prm, fix):
     else:
         _fill(s[SHADOW:AUX], s)
         # A filter that only its first fixes vouch for has no biases worth keeping.
-        _start(s, SHADOW, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
+        _start(s, shadow, prm, fix, F_HYPOTHESES + int(fix[F_CHOSEN]) * HYPOTHESIS, not known)
         s[SHADOW_COUNT] = 1.0
         # Not even with each other do they agree, so many in a row: then any is better than none of them.
         take = patient or (s[REJECTED_RUN] >= 2.0 * prm[REINIT_COUNT] and not (turned and partly))
