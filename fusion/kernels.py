@@ -354,8 +354,7 @@ def predict(f, gx, gy, gz, ax, ay, az, dt, gyro_noise, accel_noise):
     nx = qw * ex + qx * ew + qy * ez - qz * ey
     ny = qw * ey - qx * ez + qy * ew + qz * ex
     nz = qw * ez + qx * ey - qy * ex + qz * ew
-    scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
-    f[0], f[1], f[2], f[3] = nw * scale, nx * scale, ny * scale, nz * scale
+    f[0], f[1], f[2], f[3] = nw, nx, ny, nz  # `update` keeps it a unit quaternion
 
 
 @_fused
@@ -489,6 +488,8 @@ def _slow(f, dt, noise):
 def update(f, H, y, R):
     """Kalman update of the filter f (BLOCK,) with innovation y (m,), H (m, N), R (m, m). False: S is not positive.
 
+    y and R are used up: an array more takes 25 ns.
+
     P - K S Kᵀ with K S Kᵀ = Wᵀ W, W = L⁻¹ H P, S = L Lᵀ: symmetric as it is computed. The state then moves by the
     error dx, and P is expressed in the error about the new state: with R̂⁺ = R̂ Exp(δθ̂), the new error is
     Jr(δθ̂) ε for attitude and Exp(-δθ̂) ε for velocity and position.
@@ -500,8 +501,7 @@ def update(f, H, y, R):
     m = y.shape[0]
     c = COV
     W = np.zeros((m, N))
-    S = R.copy()
-    e = y.copy()
+    S, e = R, y
     for a in range(m):
         for k in range(N):
             h = H[a, k]
@@ -573,17 +573,19 @@ def update(f, H, y, R):
     scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
     f[0], f[1], f[2], f[3] = nw * scale, nx * scale, ny * scale, nz * scale
 
-    K = np.zeros((3, 3))
-    K[0, 1], K[0, 2], K[1, 2] = -z, y_, -x
-    K[1, 0], K[2, 0], K[2, 1] = z, -y_, x
-    J = np.zeros((2, 3, 3))  # of attitude; of velocity and position
+    J = np.empty((2, 3, 3))  # of attitude; of velocity and position
     for i in range(3):
-        J[0, i, i] = J[1, i, i] = 1.0
         for j in range(3):
-            K2 = K[i, 0] * K[0, j] + K[i, 1] * K[1, j] + K[i, 2] * K[2, j]
-            J[0, i, j] += sincc * K2 - half_cosc * K[i, j]
-            J[1, i, j] += half_cosc * K2 - sinc * K[i, j]
-    # J P Jᵀ as J (J P)ᵀ, the second round for the first nine columns only, as in `predict`. There only the mean of P
+            square = dx[i] * dx[j]  # of [δθ̂]x
+            J[0, i, j], J[1, i, j] = sincc * square, half_cosc * square
+        J[0, i, i] += 1.0 - sincc * angle2
+        J[1, i, i] += 1.0 - half_cosc * angle2
+        a, b = (i + 1) % 3, (i + 2) % 3
+        J[0, i, a] += half_cosc * dx[b]
+        J[0, i, b] -= half_cosc * dx[a]
+        J[1, i, a] += sinc * dx[b]
+        J[1, i, b] -= sinc * dx[a]
+    # J P Jᵀ as J (J P)ᵀ, the second round for the first nine columns only, as in `spread`. There only the mean of P
     # and Pᵀ is kept: without that the rounding of a few minutes grows into a P that is none.
     for second in range(2):
         for j in range(9 if second else N):
@@ -1131,7 +1133,7 @@ def _constrain(s, prm):
     do, by which a speed that nothing measures any more decays instead of being integrated for ever; nor, when no fix
     comes, do they leave for good the place where they have been.
     """
-    B = np.empty((3, 3))
+    B, body = np.empty((3, 3)), np.empty(3)
     still = s[T] - s[T_IMU] <= prm[IMU_GAP] and s[STILL_SINCE] <= s[T] - (
         STILL_AFTER if s[STILL_SURE] > 0.0 else 2.0 * STILL_AFTER
     )
@@ -1145,7 +1147,6 @@ def _constrain(s, prm):
         H, y, variances = np.zeros((12, N)), np.zeros(12), np.empty(12)
         _matrix(s[o:], B)
         # along body axes: v_b = Rᵀv, δv_b = δv + [v_b]x δθ
-        body = np.zeros(3)
         for i in range(3):
             body[i] = B[0, i] * s[o + V] + B[1, i] * s[o + V + 1] + B[2, i] * s[o + V + 2]
         for i in range(3):

@@ -27,11 +27,15 @@ def parameter_vector(params: FilterParams, motion: Motion) -> Array:
     return vector
 
 
+# A fix's row before anything is known of it.
+_BLANK = np.zeros(k.FIX)
+_BLANK[k.F_D2 : k.F_REPORTED] = np.nan
+
+
 def fix_row(fix: PoseFix) -> Array:
     """A fix as a row of the kernels' ring."""
-    row = np.zeros(k.FIX)
+    row = _BLANK.copy()
     row[k.F_T], row[k.F_ARRIVAL], row[k.F_COUNT] = fix.t, fix.arrival, len(fix.hypotheses)
-    row[k.F_D2 : k.F_REPORTED] = np.nan
     for i, hypothesis in enumerate(fix.hypotheses):
         at = k.F_HYPOTHESES + i * k.HYPOTHESIS
         row[at + k.H_POS : at + k.H_POS + 3] = hypothesis.position
