@@ -247,8 +247,9 @@ FAULTS = {
     "heading of the only marker": Fault(
         "marker_heading", lambda s: marked(s, -5.0, share=1.0), "off_deg", 4.2, 5.8, "differential"
     ),
+    # three of the 5 mm that the finding gives as its own sigma
     "the only marker before the axle": Fault(
-        "marker_place", lambda s: marked(s, shift=(0.1, 0.0, 0.0), share=1.0), "mm", 90, 110, "differential"
+        "marker_place", lambda s: marked(s, shift=(0.1, 0.0, 0.0), share=1.0), "mm", 85, 115, "differential"
     ),
     "drives sideways": Fault(
         "wheels_slide",
