@@ -1920,8 +1920,6 @@ def compile_moving() -> None:
     _watch.compile((_VECTOR, _VECTOR, _MATRIX, _VECTOR, types.int64))
     _absorb.compile((_VECTOR, _VECTOR, _VECTOR, types.boolean))
     _insert_fix.compile((_VECTOR, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _VECTOR))
-    _insert_row.compile((_VECTOR, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _VECTOR, types.boolean))
-    _keep_checkpoint.compile((_VECTOR, _VECTOR, _MATRIX, _VECTOR))
     _write_pose.compile((_VECTOR, _VECTOR))
     _move.compile((_VECTOR, _VECTOR, _VECTOR, types.float64))
     _grid.compile((_VECTOR, _VECTOR))
