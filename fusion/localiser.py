@@ -88,7 +88,9 @@ class Localiser:
             self._readings += len(measurement.samples)
             self._timeline.feed_wheels(measurement.samples)
         else:
-            status = self._timeline.feed_fix(fix_row(measurement))
+            # Also where nothing newer has come to show it: a start from where the robot was long ago is none.
+            too_late = measurement.arrival - measurement.t > self.params.buffer
+            status = k.TOO_LATE if too_late else self._timeline.feed_fix(fix_row(measurement))
             if status != k.PENDING:
                 outcome = Outcome(status)
                 self._outcomes[outcome] += 1

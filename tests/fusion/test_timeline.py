@@ -186,6 +186,16 @@ def test_too_late_is_counted_and_said_and_changes_nothing():
     np.testing.assert_array_equal(localiser._timeline.state[: k.SHADOW], expected[: k.SHADOW])
 
 
+def test_a_first_fix_of_long_ago_is_too_late():
+    """As of frames that have waited for the compiler."""
+    localiser = Localiser("rover", PARAMS)
+    old = replace(circle.fix(0.0), arrival=PARAMS.buffer + 0.1)
+    assert [o.outcome for o in localiser.feed(old)] == [Outcome.TOO_LATE]
+    assert not localiser.started
+    localiser.feed(replace(circle.fix(0.2), arrival=PARAMS.buffer + 0.1))
+    assert localiser.started
+
+
 def test_the_same_fix_twice():
     _, localiser = final_state([circle.batch(np.arange(0.0, 1.0, 0.01)), circle.fix(0.5)])
     assert [o.outcome for o in localiser.feed(circle.fix(0.5, delay=0.3))] == [Outcome.DUPLICATE]
