@@ -19,12 +19,18 @@ NOTICE = "compiling the filters; this happens once after each update and may tak
 
 def load_or_compile(engine: Engine = "numba") -> None:
     """`warm_up`, with the help of a second interpreter, as numba compiles one thing at a time in each."""
-    index = f"{Path(kernels.__file__).stem}.{kernels.process.__name__}-*.nbi"
-    if engine == "numba" and (os.cpu_count() or 1) > 1 and not any(Path(kernels.process.stats.cache_path).glob(index)):
+    if engine == "numba" and (os.cpu_count() or 1) > 1 and not _in_cache():
         beside = [sys.executable, "-c", "from fusion import kernels; kernels.compile_moving()"]
         with subprocess.Popen(beside, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
             kernels.compile_taking()
     warm_up(engine)
+
+
+def _in_cache() -> bool:
+    """Whether numba has compiled the kernels since they were last changed."""
+    source = Path(kernels.__file__)
+    written = Path(kernels.process.stats.cache_path).glob(f"{source.stem}.{kernels.process.__name__}-*.nbi")
+    return any(index.stat().st_mtime > source.stat().st_mtime for index in written)
 
 
 def compile_filter() -> None:
