@@ -32,6 +32,7 @@ from tests.server.room import (
     CONFIG,
     INTRINSICS,
     Ceiling,
+    beside,
     client,
     fix,
     get,
@@ -725,13 +726,8 @@ async def sending(connection: ClientConnection, reading: list[float]) -> AsyncIt
             stamps = time.monotonic() - 0.005 * np.arange(10)[::-1]
             await connection.send(json.dumps({"type": "imu", "samples": np.column_stack([stamps, rows]).tolist()}))
 
-    task = asyncio.create_task(send())
-    try:
+    async with beside(send()):
         yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
 
 
 def test_g_that_were_not_declared_are_noticed_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
