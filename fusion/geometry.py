@@ -84,7 +84,7 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Array:
 
     The largest of the four is computed first, so that no small number is divided by (Shepperd's method, 1978).
     """
-    # In scalars: arrays of four take six times as long.
+    # In scalars, since arrays of four take several times as long.
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64).tolist()
     # 4 w², 4 x², 4 y², 4 z² from the diagonal
     w2, x2, y2, z2 = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i

@@ -243,7 +243,7 @@ UNKNOWN_TILT_SIGMA = math.radians(30.0)  # of a flat marker whose two poses are 
 _jit: Any = njit(cache=True, error_model="numpy", nogil=True, fastmath=False, forceinline=False)
 # Where most of the time goes: products and sums in one instruction each.
 _fused: Any = njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract"}, forceinline=False)
-# For what every sample goes through: a call is dear, since each array is seven arguments. 0.23 -> 0.18 us a sample.
+# For what every sample goes through: a call is dear, since each array is seven arguments.
 _inline: Any = njit(cache=True, error_model="numpy", nogil=True, fastmath=False, forceinline=True)
 
 
@@ -489,7 +489,7 @@ def _slow(f, dt, noise):
 def update(f, H, y, R):
     """Kalman update of the filter f (BLOCK,) with innovation y (m,), H (m, N), R (m, m). False: S is not positive.
 
-    y and R are used up: an array more takes 25 ns.
+    y and R are used up.
 
     P - K S Kᵀ with K S Kᵀ = Wᵀ W, W = L⁻¹ H P, S = L Lᵀ: symmetric as it is computed. The state then moves by the
     error dx, and P is expressed in the error about the new state: with R̂⁺ = R̂ Exp(δθ̂), the new error is
@@ -537,12 +537,12 @@ def update(f, H, y, R):
             for i in range(N):
                 f[c + N * i + j] -= W[a, i] * w
 
-    tells = 0.0
+    tells = False
     for a in range(m):
-        if H[a, DTD] != 0.0:
-            tells = 1.0
-    for i in range(3):
-        dx[DP + i] -= tells * dx[DV + i] * dx[DTD]
+        tells |= H[a, DTD] != 0.0
+    if tells:
+        for i in range(3):
+            dx[DP + i] -= dx[DV + i] * dx[DTD]
     B = np.empty((3, 3))
     _matrix(f, B)
     for i in range(3):
@@ -589,10 +589,11 @@ def update(f, H, y, R):
     # J P Jᵀ as J (J P)ᵀ, the second round for the first nine columns only, as in `spread`. There only the mean of P
     # and Pᵀ is kept: without that the rounding of a few minutes grows into a P that is none.
     for second in range(2):
-        for j in range(9 if second else N):
+        if tells:
             for i in range(3):
-                product = dx[DV + i] * f[c + N * DTD + j] + dx[DTD] * f[c + N * (DV + i) + j]
-                f[c + N * (DP + i) + j] -= tells * product
+                for j in range(9 if second else N):
+                    f[c + N * (DP + i) + j] -= dx[DV + i] * f[c + N * DTD + j] + dx[DTD] * f[c + N * (DV + i) + j]
+        for j in range(9 if second else N):
             for block in range(3):
                 n = min(block, 1)
                 r = c + 3 * N * block + j

@@ -199,7 +199,7 @@ class DeviceClock:
             spacing = UNSTAMPED_SPACING
         stamps = []
         last, delay = self._last_stamp, self.minimum_delay or 0.0
-        # `_line`, written out: calls for each sample would be a quarter of the time that this takes.
+        # `_line`, written out: a call for each sample would be much of the time that this takes.
         (origin, host), offset, skew = self._origin or (math.nan, math.nan), self._offset, self.skew
         for i, device_time in enumerate(times):
             if device_time is None:
