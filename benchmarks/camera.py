@@ -121,7 +121,7 @@ def believed(random: np.random.Generator, poses: Mapping[int, Array]) -> dict[st
         dx, dy, dyaw = random.normal(0.0, [POSITION_SIGMA, POSITION_SIGMA, YAW_SIGMA]).tolist()
         quaternion = quaternion_from_rotation(rotation_about_z(dyaw) @ pose[:3, :3])
         position = pose[:3, 3] + [dx, dy, 0.0]
-        known[str(id)] = Pose(
+        known[str(id)] = Pose.of(
             str(id), 0.0, position, quaternion, covariance=covariance, mode=Mode.FULL, reset_id=0, fix_age=0.0, **still
         )
     return known

@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection
 
 import msgspec
 import numpy as np
+from tqdm import tqdm
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 
@@ -25,6 +26,8 @@ from server.messages import Dialect, Imu
 ROBOTS, RATE_HZ, BATCH, POSE_RATE_HZ = 50, 200.0, 10, 50.0
 # s: until all is at its pace, and what is then measured.
 SETTLE, MEASURE = 3.0, 10.0
+# Of the share of a core: it varies by a fifth with what else the machine does, from minute to minute.
+RUNS = 5
 # s between the fixes of each robot, and how old they are when they come.
 FIX_EVERY, FIX_DELAY = 0.5, 0.15
 
@@ -55,17 +58,30 @@ def robots() -> None:
     """Prints the share of a core that the service takes for one robot and for fifty, each with a filter and two fixes a
     second, and how long after a batch has come the first pose that holds it leaves.
 
-    Before that the share of what the same messages take where nothing is done with them: both depend on what else the
-    machine does, their ratio less.
+    Besides the share of what the same messages take where nothing is done with them: both depend on what else the
+    machine does, their ratio less. Each is the median of runs that alternate, with the least and the most.
     """
-    print(f"{'robots':>7}{'samples/s':>11}{'poses/s':>9}{'of a core':>11}{'p50 ms':>9}{'p99 ms':>9}{'format':>10}")
-    share, samples, poses, _ = _run(_traffic, ROBOTS, "json", latency=False)
-    print(f"{ROBOTS:7}{samples:11.0f}{poses:9.0f}{share:11.3f}{'traffic alone':>28}", flush=True)
-    for count, format in ((1, "json"), (ROBOTS, "json"), (ROBOTS, "msgpack")):
-        share, samples, poses, _ = _run(_service, count, format, latency=False)
-        *_, delays = _run(_service, count, format, latency=True)
-        p50, p99 = 1e3 * np.percentile(delays, (50, 99))
-        print(f"{count:7}{samples:11.0f}{poses:9.0f}{share:11.3f}{p50:9.2f}{p99:9.2f}{format:>10}", flush=True)
+    kinds = (
+        ("traffic alone", _traffic, ROBOTS, "json"),
+        ("one robot", _service, 1, "json"),
+        ("JSON", _service, ROBOTS, "json"),
+        ("msgpack", _service, ROBOTS, "msgpack"),
+    )
+    found: dict[str, list[tuple[float, float, float, Array]]] = {name: [] for name, *_ in kinds}
+    for _ in tqdm(range(RUNS), leave=False):
+        for name, serving, count, format in kinds:
+            found[name].append(_run(serving, count, format, latency=False))
+    print(f"{'':14}{'samples/s':>11}{'poses/s':>9}{'of a core':>11}{'least':>8}{'most':>8}{'p50 ms':>9}{'p99 ms':>9}")
+    for name, serving, count, format in kinds:
+        shares, samples, poses = zip(
+            *((share, samples, poses) for share, samples, poses, _ in found[name]), strict=True
+        )
+        figures = f"{np.median(samples):11.0f}{np.median(poses):9.0f}{np.median(shares):11.3f}"
+        figures += f"{min(shares):8.3f}{max(shares):8.3f}"
+        if serving is _service:
+            *_, delays = _run(serving, count, format, latency=True)
+            figures += "".join(f"{1e3 * delay:9.2f}" for delay in np.percentile(delays, (50, 99)))
+        print(f"{name:14}{figures}", flush=True)
     print(f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 

@@ -103,18 +103,20 @@ class Health:
 
     def sampled(self, samples: Array, track: Array) -> None:
         """Samples (n, 7) that were fed, and the track (n, 8) of it: what was published with each."""
-        for at in range(0, len(samples), _KEEP):
-            n = min(_KEEP, len(samples) - at)
-            if self._end + n > len(self._rows):
-                self._digest()
-                self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
-                self._digested -= self._end - _KEEP
-                self._end = _KEEP
-            self._rows[self._end : self._end + n] = samples[at : at + _KEEP]
-            self._end += n
-            given = self._given[0].next(n)
-            given[:, :8], given[:, 8] = track[at : at + _KEEP], self._last_fix
-        self._last_fix = self.localiser.last_fix
+        n = len(samples)
+        if n > _KEEP:
+            for at in range(0, n, _KEEP):
+                self.sampled(samples[at : at + _KEEP], track[at : at + _KEEP])
+            return
+        if self._end + n > len(self._rows):
+            self._digest()
+            self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
+            self._digested -= self._end - _KEEP
+            self._end = _KEEP
+        self._rows[self._end : self._end + n] = samples
+        self._end += n
+        given = self._given[0].next(n)
+        given[:, :8], given[:, 8] = track, self._last_fix
 
     def wheels(self, odometry: WheelOdometry) -> None:
         """Readings of the wheels that were fed."""
@@ -124,8 +126,7 @@ class Health:
 
     def published(self, pose: Pose) -> None:
         """A pose that was given out, later than the one before."""
-        row = self._given[1].next(1)[0]
-        row[0], row[1:4], row[4:8], row[8] = pose.t, pose.position, pose.quaternion_wxyz, pose.t - pose.fix_age
+        self._given[1].next(1)[0] = pose.numbers[:9]
 
     def another_imu(self) -> None:
         """The device has connected anew, or it is another one: what the last one sent is no measure for it."""
@@ -145,6 +146,8 @@ class Health:
 
     def judged(self, outcomes: Sequence[FixOutcome]) -> None:
         """What the localiser made of fixes."""
+        if not outcomes:
+            return
         for outcome in outcomes:
             if outcome.outcome is Outcome.DUPLICATE:
                 continue

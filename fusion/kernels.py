@@ -187,10 +187,10 @@ IMU_ROW, WHEEL_ROW = 7, 3  # t, gyro, accel; t, forward speed, yaw rate
 FAR_AHEAD = 60.0  # s
 CP_PER_BUFFER = 20  # a checkpoint each twentieth of the buffer, 100 ms by default: what is written stays in the cache
 
-# --- A pose as it leaves: t, position, quaternion, velocity, rate, covariance, velocity covariance, bookkeeping ----
-P_T, P_POS, P_QUAT, P_VEL, P_RATE, P_COV, P_VCOV = 0, 1, 4, 8, 11, 14, 50
-P_T_ACCEPTED, P_RESET_ID, P_T_IMU = 59, 60, 61
-P_STEP = 62  # of the last reset: position (3), rotation vector (3), world
+# --- A pose as it leaves: `fusion.measurements.Pose.numbers` and its bookkeeping ----
+P_T, P_POS, P_QUAT, P_T_ACCEPTED, P_VEL, P_RATE, P_COV, P_VCOV = 0, 1, 4, 8, 9, 12, 15, 51
+P_STEP = 60  # of the last reset: position (3), rotation vector (3), world
+P_RESET_ID, P_T_IMU = 66, 67
 POSE = 68
 
 LONGEST_LAG = 0.018  # s: of the covariance behind the state: four samples at 200 Hz

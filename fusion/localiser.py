@@ -249,29 +249,17 @@ class Localiser:
         row = self._timeline.pose_at(t, channel)
         if row is None:
             return None
-        covariance = row[k.P_COV : k.P_COV + 36].reshape(6, 6)
         fix_age = t - float(row[k.P_T_ACCEPTED])
-        return Pose(
-            robot=self.robot,
-            t=t,
-            position=row[k.P_POS : k.P_POS + 3],
-            quaternion_wxyz=row[k.P_QUAT : k.P_QUAT + 4],
-            velocity=row[k.P_VEL : k.P_VEL + 3],
-            angular_velocity=row[k.P_RATE : k.P_RATE + 3],
-            covariance=covariance,
-            velocity_covariance=row[k.P_VCOV : k.P_VCOV + 9].reshape(3, 3),
-            mode=self._mode(fix_age, t - float(row[k.P_T_IMU]), covariance),
-            reset_id=self._resets + int(row[k.P_RESET_ID]),
-            fix_age=fix_age,
-            reset_step=row[k.P_STEP : k.P_STEP + 6],
-        )
+        mode = self._mode(fix_age, t - float(row[k.P_T_IMU]), row)
+        return Pose(self.robot, t, row, mode, self._resets + int(row[k.P_RESET_ID]), fix_age)
 
-    def _mode(self, fix_age: float, imu_age: float, covariance: Array) -> Mode:
+    def _mode(self, fix_age: float, imu_age: float, row: Array) -> Mode:
         coasting = fix_age > self.params.coast_after
         if imu_age > self.params.imu_gap:
             return Mode.LOST if coasting else Mode.NO_IMU
         if not coasting:
             return Mode.FULL
+        covariance = row[k.P_COV : k.P_COV + 36].reshape(6, 6)
         sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         if sigma > self.params.invalid_sigma:
             return Mode.INVALID

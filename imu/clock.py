@@ -15,7 +15,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from itertools import islice, pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -93,12 +93,9 @@ class DeviceClock:
         self._late_since = math.inf
         self._questions: deque[_Question] = deque(maxlen=EXCHANGES)
         self._best: _Question | None = None
+        self.minimum_delay: float | None = None
         # s after which the device's counter starts again from zero; inf until it has been seen to.
         self._wrap = math.inf
-
-    @property
-    def minimum_delay(self) -> float | None:
-        return None if self._best is None else max(0.0, 0.5 * (self._line(self._best.received) - self._best.sent))
 
     def observe(self, device_time: float, arrival: float) -> None:
         """A sample that the device stamped reached the host at `arrival`. Samples come in the order they were taken."""
@@ -108,9 +105,13 @@ class DeviceClock:
                 if self._newest < wrap and -JUMP <= arrival - self._line(device_time + wrap) <= LATE:
                     self._wrap = wrap
                     unwrapped = device_time + wrap
-        self._observe(unwrapped, arrival, back=unwrapped < self._newest - JUMP)
+        self._follow(unwrapped, arrival)
+
+    def _follow(self, device_time: float, arrival: float) -> None:
+        """The same, on a counter without end."""
+        self._observe(device_time, arrival, back=device_time < self._newest - JUMP)
         if not self._suspect:
-            self._newest = max(self._newest, unwrapped)
+            self._newest = max(self._newest, device_time)
 
     def _unwrap(self, device_time: float, near: float) -> float:
         """`device_time` on a counter without end, where it is nearest to `near`."""
@@ -152,6 +153,7 @@ class DeviceClock:
             self._buckets[-1] = (x, y)
         # Never above a point: no stamp may lie after its arrival.
         self._offset = min(self._offset, y - self.skew * x)
+        self._find_delay()
 
     def exchange(self, sent: float, received_device: float, sent_device: float, arrival: float) -> None:
         """The host sent at `sent`, the device received and answered by its own clock, the answer came at `arrival`."""
@@ -167,14 +169,14 @@ class DeviceClock:
             return
         self._questions.append(_Question(sent, received_device))
         self._choose()
+        self._find_delay()
 
     def to_host(self, device_time: float) -> float:
         """Host time of `device_time`; of a stamp that was observed never later than its arrival.
 
         nan before the first observation.
         """
-        delay = self.minimum_delay
-        return self._line(self._unwrap(device_time, self._newest)) - (delay or 0.0)
+        return self._line(self._unwrap(device_time, self._newest)) - (self.minimum_delay or 0.0)
 
     def to_device(self, t: float) -> float:
         """The device's time at host time `t`, the inverse of `to_host`; nan before the first observation."""
@@ -188,41 +190,44 @@ class DeviceClock:
         a jump of the device's clock, the second holds). Samples without a device time are spread evenly over the time
         since the last arrival: all that is known of them.
         """
-        times = [sample[0] for sample in samples]
-        for device_time in times[-1:] if self._is_usual(times, arrival) else times:
-            self.has_stamps = device_time is not None
-            if device_time is not None:
-                self.observe(device_time, arrival)
         n = len(samples)
-        spacing = (arrival - self._last_arrival) / max(1, n)
+        if not n:
+            return np.empty((0, 7))
+        times = [sample[0] for sample in samples]
+        if self._is_usual(times, arrival):
+            self.has_stamps = True
+            self._follow(times[-1], arrival)
+        else:
+            for device_time in times:
+                self.has_stamps = device_time is not None
+                if device_time is not None:
+                    self.observe(device_time, arrival)
+            if self._wrap != math.inf:
+                times = [None if t is None else self._unwrap(t, self._newest) for t in times]
+        spacing = (arrival - self._last_arrival) / n
         if not spacing < UNSTAMPED_PAUSE:
             spacing = UNSTAMPED_SPACING
-        stamps = []
-        last, delay = self._last_stamp, self.minimum_delay or 0.0
         # `_line`, written out: a call for each sample would be much of the time that this takes.
-        (origin, host), offset, skew = self._origin or (math.nan, math.nan), self._offset, self.skew
+        origin, host = self._origin or (math.nan, math.nan)
+        host += self._offset - (self.minimum_delay or 0.0)
+        slope, latest, stamps = 1.0 + self.skew, self._last_stamp, []
         for i, device_time in enumerate(times):
-            if device_time is None:
-                t = arrival - (n - 1 - i) * spacing
-            else:
-                x = (device_time if self._wrap == math.inf else self._unwrap(device_time, self._newest)) - origin
-                t = host + x + offset + skew * x - delay
-            if t < last + MONOTONE_STEP:
-                t = last + MONOTONE_STEP
-            last = t if t < arrival else arrival
-            stamps.append(last)
-        self._last_stamp = last
-        self._last_arrival = arrival
-        stamped = np.array(samples, dtype=np.float64).reshape(n, 7)
+            t = arrival - (n - 1 - i) * spacing if device_time is None else host + slope * (device_time - origin)
+            if t < latest + MONOTONE_STEP:
+                t = latest + MONOTONE_STEP
+            latest = t if t < arrival else arrival
+            stamps.append(latest)
+        self._last_stamp, self._last_arrival = latest, arrival
+        stamped = np.array(samples, dtype=np.float64)
         stamped[:, 0] = stamps
         return stamped
 
-    def _is_usual(self, times: Sequence[float | None], arrival: float) -> bool:
+    def _is_usual(self, times: list[float | None], arrival: float) -> TypeGuard[list[float]]:
         """Whether samples that arrived together follow the last ones, oldest first, without a jump or a wrap.
 
         Then the newest alone can move the line, since it has the least delay of them.
         """
-        if not times or self._suspect or self._wrap != math.inf:
+        if self._suspect or self._wrap != math.inf:
             return False
         before = self._newest - JUMP
         for device_time in times:
@@ -273,6 +278,11 @@ class DeviceClock:
         """The question that was the quickest on its way there."""
         slope = 1.0 + self.skew - AGEING
         self._best = min(self._questions, key=lambda q: slope * q.received - q.sent, default=None)
+
+    def _find_delay(self) -> None:
+        """Half of the best way there and the best way back, which the line is."""
+        if self._best is not None:
+            self.minimum_delay = max(0.0, 0.5 * (self._line(self._best.received) - self._best.sent))
 
 
 def _hull_slope(points: Sequence[tuple[float, float]]) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -151,36 +152,37 @@ class StreamHealth:
         self.parser = parser
         self.port = port
         self.samples = 0
-        self._ring = np.empty((9, 2 * KEEP))
-        self._end = 0
+        # What came together: the device's stamps, the readings, when.
+        self._arrivals: deque[tuple[list[float | None], Array, float]] = deque()
+        self._kept = 0
 
     def feed(self, raw: Sequence[Reading], readings: Array, arrival: float = math.nan) -> None:
         """Samples that arrived together: as the device stamped them, and (n, 7) as in an `ImuBatch`.
 
         `arrival`: s on the host, NaN where it says nothing, as of a file.
         """
-        n = len(readings)
-        if n == 0:
+        if not len(readings):
             return
-        if n > KEEP:
-            raw, readings = raw[-KEEP:], readings[-KEEP:]
-        self.samples += n
-        n = len(readings)
-        if self._end + n > 2 * KEEP:
-            self._ring[:, :KEEP] = self._ring[:, self._end - KEEP : self._end]
-            self._end = KEEP
-        rows = self._ring[:, self._end : self._end + n]
-        rows[0] = [sample[0] for sample in raw]  # None becomes NaN.
-        rows[1] = readings[:, 0]
-        rows[2] = arrival
-        rows[3:] = readings[:, 1:].T
-        self._end += n
+        self.samples += len(readings)
+        self._kept += len(readings)
+        self._arrivals.append(([sample[0] for sample in raw], readings, arrival))
+        while self._kept - len(self._arrivals[0][1]) >= KEEP:
+            self._kept -= len(self._arrivals.popleft()[1])
 
     def _window(self) -> _Window:
         """The last WINDOW seconds."""
-        rows = self._ring[:, max(0, self._end - KEEP) : self._end]
-        t = rows[1]
-        old = np.flatnonzero(t <= t[-1:] - WINDOW)
+        if not self._arrivals:
+            return _Window(np.empty((9, 0)))
+        since = self._arrivals[-1][1][-1, 0] - WINDOW
+        recent = [*itertools.takewhile(lambda one: not one[1][-1, 0] <= since, reversed(self._arrivals))][::-1]
+        times, readings, arrivals = zip(*recent, strict=True)
+        together = np.concatenate(readings)
+        rows = np.empty((9, len(together)))
+        rows[0] = list(itertools.chain.from_iterable(times))  # None becomes NaN.
+        rows[1], rows[3:] = together[:, 0], together[:, 1:].T
+        rows[2] = np.repeat(arrivals, [len(one) for one in readings])
+        rows = rows[:, -KEEP:]
+        old = np.flatnonzero(rows[1] <= since)
         return _Window(rows[:, old[-1] + 1 :] if len(old) else rows)
 
     def rest(self) -> Rest | None:

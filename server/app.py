@@ -68,10 +68,12 @@ MAX_MESSAGE = 64 * 1024
 TRACKER: Topic = ("tracker",)
 # Bytes of the original stream that may wait for a client: there each message counts, so some may.
 TRACKER_ROOM = 64 * 1024
+# How those are spoken to who have said nothing of it.
+PLAIN = Dialect()
 # s without a word after which a robot's connection is taken for dead, and another may take its place.
 SILENCE = 3.0
 # s between two rounds of diagnoses; and their share of the loop's time within one, since each takes some milliseconds.
-DIAGNOSE_EVERY, DIAGNOSE_SHARE = 5.0, 0.05
+DIAGNOSE_EVERY, DIAGNOSE_SHARE = 5.0, 0.03
 # s that a camera waits for the filters' word; without it, it looks where the markers were last.
 POSES_TIMEOUT = 0.05
 # s that closing may take: for clients that do not answer, and for threads that hang in a driver.
@@ -348,7 +350,7 @@ class Service:
                 return None
             if channel == "own":
                 link = self._links.get(name)
-                return robot.encode_own(pose, now, link.visitor.dialect if link is not None else Dialect())
+                return robot.encode_own(pose, now, link.visitor.dialect if link is not None else PLAIN)
             return FORMATS[format[0]](robot.message(pose, now))
 
         self.hub.publish(now, message)
@@ -520,7 +522,7 @@ class Service:
             # What a slow client has not taken then waits here, where the newer replaces it, and not in the kernel.
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 16 * 1024)
         return self.hub.subscribed(
-            lambda data: broadcast([connection], data, text=text),
+            functools.partial(broadcast, [connection], text=text),
             transport.get_write_buffer_size,
             transport.abort,
             topics,

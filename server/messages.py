@@ -15,7 +15,16 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from fusion.measurements import Array, Pose
+from fusion.measurements import (
+    ANGULAR_VELOCITY,
+    COVARIANCE,
+    POSITION,
+    QUATERNION,
+    RESET_STEP,
+    VELOCITY,
+    Array,
+    Pose,
+)
 from fusion.params import GRAVITY
 from imu.clock import Reading
 from imu.protocols import FORCE_LIMIT, RATE_LIMIT, TIME_LIMIT
@@ -185,7 +194,7 @@ class Dialect:
             message: FromRobot = text.decode(data) if isinstance(data, str) else binary.decode(data)
         except (msgspec.DecodeError, RecursionError) as error:
             raise MessageError(_explain(data, str(error), self)) from None
-        if isinstance(message, Imu | Wheels):
+        if isinstance(message, (Imu, Wheels)):  # a union is made anew each time
             stamps = [sample[0] for sample in message.samples if sample[0] is not None]
             span = (max(stamps) - min(stamps)) * TIMES[self.clock.unit] if stamps else 0.0
             # A counter that wraps within the message is no error.
@@ -345,22 +354,23 @@ def _shown(value: object) -> str:
 
 
 def pose_message(pose: Pose, published: float, seq: int, t_robot: float | None = None) -> PoseMessage:
+    numbers = pose.numbers.tolist()
     return PoseMessage(
         robot=pose.robot,
         t=pose.t,
         published=published,
         seq=seq,
         frame="world",
-        position=pose.position.tolist(),
-        orientation_wxyz=pose.quaternion_wxyz.tolist(),
+        position=numbers[POSITION],
+        orientation_wxyz=numbers[QUATERNION],
         yaw=pose.yaw,
-        velocity=pose.velocity.tolist(),
-        angular_velocity=pose.angular_velocity.tolist(),
-        covariance=pose.covariance.ravel().tolist(),
+        velocity=numbers[VELOCITY],
+        angular_velocity=numbers[ANGULAR_VELOCITY],
+        covariance=numbers[COVARIANCE],
         mode=pose.mode,
         reset_id=pose.reset_id,
         fix_age=pose.fix_age if math.isfinite(pose.fix_age) else None,
-        reset_step=pose.reset_step.tolist() if pose.reset_id and pose.reset_step.any() else UNSET,
+        reset_step=step if pose.reset_id and any(step := numbers[RESET_STEP]) else UNSET,
         t_robot=UNSET if t_robot is None else t_robot,
     )
 

@@ -174,7 +174,7 @@ def test_a_camera_believed_elsewhere_moves_the_fix_with_it():
 
 
 def known_at(world_from_body, covariance=None, velocity=(0.0, 0.0, 0.0)):
-    return Pose(
+    return Pose.of(
         "rover", 1.0, world_from_body[:3, 3], quaternion_from_rotation(world_from_body[:3, :3]), np.array(velocity),
         np.array([0.0, 0.0, 0.5]), np.diag([1e-4] * 3 + [1e-4] * 3) if covariance is None else covariance,
         np.eye(3), Mode.FULL, 0, 0.0,

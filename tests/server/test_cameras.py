@@ -140,7 +140,9 @@ def test_a_blurred_marker_is_followed_where_the_filter_predicts_it(watch):
         quaternion, still = quaternion_from_rotation(pose[:3, :3]), np.zeros(3)
         covariance = np.diag([1e-5, 1e-5, 1e-6, 1e-6, 1e-6, 1e-4])
         return {
-            "rover": Pose("rover", t, pose[:3, 3], quaternion, still, still, covariance, np.eye(3), Mode.FULL, 0, 0.0)
+            "rover": Pose.of(
+                "rover", t, pose[:3, 3], quaternion, still, still, covariance, np.eye(3), Mode.FULL, 0, 0.0
+            )
         }
 
     pictures = [picture(place, moved=0.05 if k else 0.0) for k, place in enumerate(places)]

@@ -40,7 +40,7 @@ linux = pytest.mark.skipif(not CHILDREN.exists(), reason="this system has no /pr
 
 def published(body: Body, t: float = 0.0, mode: Mode = Mode.FULL) -> PoseMessage:
     """The truth, as a pose."""
-    pose = Pose(
+    pose = Pose.of(
         robot="rover",
         t=t,
         position=np.array([body.x, body.y, 0.0]),
@@ -174,7 +174,7 @@ def test_the_score() -> None:
 
 def _off(t: float, error: float) -> Pose:
     yaw = wrap(3.0 * t + math.radians(2.0))
-    return Pose(
+    return Pose.of(
         robot="rover",
         t=t,
         position=np.array([math.sin(t) - error, 0.5 * t, 0.01]),

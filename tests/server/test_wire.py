@@ -27,7 +27,7 @@ from server.messages import (
     tracker_message,
 )
 
-POSE = Pose(
+POSE = Pose.of(
     robot="rover",
     t=10.0,
     position=np.array([1.0, 2.0, 0.12]),
