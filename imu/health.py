@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -98,11 +97,12 @@ class Rest(NamedTuple):
 
 
 class _Window:
-    """Samples as (9, n): by the device's clock, as stamped, arrival, rates, forces. One row a quantity: reductions
-    along what lies side by side in memory are several times as fast."""
+    """Samples (n, 9): by the device's clock, arrival, as stamped, rates, forces. They are kept one row a quantity:
+    reductions along what lies side by side in memory are several times as fast."""
 
-    def __init__(self, rows: Array) -> None:
-        self.device, self.t, self.arrival = rows[:3]
+    def __init__(self, samples: Array) -> None:
+        rows = np.ascontiguousarray(samples.T)
+        self.device, self.arrival, self.t = rows[:3]
         self.readings, self.gyro, self.force = rows[3:], rows[3:6], rows[6:]
 
     def __len__(self) -> int:
@@ -152,38 +152,37 @@ class StreamHealth:
         self.parser = parser
         self.port = port
         self.samples = 0
-        # What came together: the device's stamps, the readings, when.
-        self._arrivals: deque[tuple[list[float | None], Array, float]] = deque()
-        self._kept = 0
+        # Stamp of the device, arrival, stamp on the host, readings. A row a sample is quicker to write than a column.
+        self._ring = np.empty((2 * KEEP, 9))
+        self._end = 0
 
     def feed(self, raw: Sequence[Reading], readings: Array, arrival: float = math.nan) -> None:
         """Samples that arrived together: as the device stamped them, and (n, 7) as in an `ImuBatch`.
 
         `arrival`: s on the host, NaN where it says nothing, as of a file.
         """
-        if not len(readings):
+        n = len(readings)
+        if n == 0:
             return
-        self.samples += len(readings)
-        self._kept += len(readings)
-        self._arrivals.append(([sample[0] for sample in raw], readings, arrival))
-        while self._kept - len(self._arrivals[0][1]) >= KEEP:
-            self._kept -= len(self._arrivals.popleft()[1])
+        if n > KEEP:
+            raw, readings = raw[-KEEP:], readings[-KEEP:]
+        self.samples += n
+        n = len(readings)
+        if self._end + n > 2 * KEEP:
+            self._ring[:KEEP] = self._ring[self._end - KEEP : self._end]
+            self._end = KEEP
+        rows = self._ring[self._end : self._end + n]
+        rows[:, 0] = [sample[0] for sample in raw]  # None becomes NaN.
+        rows[:, 1] = arrival
+        rows[:, 2:] = readings
+        self._end += n
 
     def _window(self) -> _Window:
         """The last WINDOW seconds."""
-        if not self._arrivals:
-            return _Window(np.empty((9, 0)))
-        since = self._arrivals[-1][1][-1, 0] - WINDOW
-        recent = [*itertools.takewhile(lambda one: not one[1][-1, 0] <= since, reversed(self._arrivals))][::-1]
-        times, readings, arrivals = zip(*recent, strict=True)
-        together = np.concatenate(readings)
-        rows = np.empty((9, len(together)))
-        rows[0] = list(itertools.chain.from_iterable(times))  # None becomes NaN.
-        rows[1], rows[3:] = together[:, 0], together[:, 1:].T
-        rows[2] = np.repeat(arrivals, [len(one) for one in readings])
-        rows = rows[:, -KEEP:]
-        old = np.flatnonzero(rows[1] <= since)
-        return _Window(rows[:, old[-1] + 1 :] if len(old) else rows)
+        rows = self._ring[max(0, self._end - KEEP) : self._end]
+        t = rows[:, 2]
+        old = np.flatnonzero(t <= t[-1:] - WINDOW)
+        return _Window(rows[old[-1] + 1 :] if len(old) else rows)
 
     def rest(self) -> Rest | None:
         """What the sensor reads at rest; None while it moves, or where too little is known."""
