@@ -54,6 +54,12 @@ def solve_planar(
     return state, covariance, systematic, misfit
 
 
+def warm_up() -> None:
+    """Compile, or load from numba's cache, before the first picture needs it."""
+    nothing = np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int_)
+    solve_planar(*nothing, np.eye(4), np.zeros((6, 6)))
+
+
 @_jit
 def _solve(points, rays, by_ray, sigma, count, pose, placement, state, covariance, systematic, misfit):
     J = np.zeros((2, 6))

@@ -211,10 +211,12 @@ class Service:
             else:
                 warm.set_result(None)
 
+        camera = not all(isinstance(camera, RemoteCamera) for camera in self.cameras.values())
+
         def work() -> None:
             try:
                 for engine in sorted({robot.config.engine for robot in self.robots.values()}):
-                    load_or_compile(engine)
+                    load_or_compile(engine, camera=camera)
             except Exception as error:
                 self._call_from_thread(end, error)
             else:

@@ -1,7 +1,8 @@
-"""Compiling the filter, as fast as the machine can, and saying so."""
+"""Compiling the kernels, as fast as the machine can, and saying so."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -17,11 +18,18 @@ PATIENCE = 3.0
 NOTICE = "compiling the filters; this happens once after each update and may take a minute"
 
 
-def load_or_compile(engine: Engine = "numba") -> None:
-    """`warm_up`, with the help of a second interpreter, as numba compiles one thing at a time in each."""
+# numba compiles one thing at a time in an interpreter, and others find it in its cache.
+_MOVING = "from fusion import kernels; kernels.compile_moving()"
+_CAMERA = "from camera import edges, planar; edges.warm_up(); planar.warm_up()"
+
+
+def load_or_compile(engine: Engine = "numba", *, camera: bool = False) -> None:
+    """`warm_up`, with the help of other interpreters; `camera`: one of them sees to the camera's kernels meanwhile."""
     if engine == "numba" and (os.cpu_count() or 1) > 1 and not _in_cache():
-        beside = [sys.executable, "-c", "from fusion import kernels; kernels.compile_moving()"]
-        with subprocess.Popen(beside, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
+        with contextlib.ExitStack() as beside:
+            for work in (_MOVING, _CAMERA) if camera else (_MOVING,):
+                command = [sys.executable, "-c", work]
+                beside.enter_context(subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
             kernels.compile_taking()
     warm_up(engine)
 
