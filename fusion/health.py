@@ -1,7 +1,7 @@
 """How well a robot's localisation is: running figures, and what is wrong with it (`fusion.diagnosis`).
 
-`Health` looks on while a `Localiser` is fed and changes nothing. A sample costs it a row in a ring, a fix a look-up
-there; all else is done when it is asked. What it says is about the last two minutes.
+`Health` looks on while a `Localiser` is fed and changes nothing. What is fed and published it only keeps, for a fix it
+looks up what was published; all else is done when it is asked. What it says is about the last two minutes.
 
 **Accuracy without ground truth.** A fix judges the pose that was published for its instant before the fix had arrived:
 a ring keeps what was published, of the channel that was. The innovation would not do, since it is computed after
@@ -36,27 +36,45 @@ _ROOTS = {"accel_unit", "gyro_unit", "gyro_sign", "imu_mounting", "gyro_saturate
 _ROOTS |= {"wheel_unit", "wheel_turn_unit"}
 _BESIDES = {"imu_missing", "imu_stamps_repeat", "no_fix", "fixes_lost", "fixes_late", "fixes_early"}
 
-_KEEP = 4096  # rows that stay when a ring is full: the filter's own ring holds as many
+_KEEP = 4096  # poses that stay when their ring is full, and samples of which a chunk is made at the latest
+_SEVERAL = 100  # times that poses came, after which they are put into their ring also unasked
 
 
 class _Poses:
-    """Poses that were given out, and the last fix in each: rows of t, position, quaternion wxyz, instant of the fix."""
+    """Poses that were given out, and the last fix in each: rows of t, position, quaternion wxyz, instant of the fix.
+
+    They are put in their place when they are asked for, which is far more seldom than they come.
+    """
 
     def __init__(self) -> None:
         self._rows = np.empty((2 * _KEEP, 9))
         self._instants = self._rows[:, 0]
         self._end = 0
+        self._new: list[tuple[Array, float]] = []
 
-    def next(self, n: int) -> Array:
-        """(n, 9), to be filled with as many more; n <= _KEEP."""
+    def add(self, poses: Array, last_fix: float) -> None:
+        """Rows of which the first 8 columns count."""
+        self._new.append((poses, last_fix))
+        if len(self._new) >= _SEVERAL:
+            self._place()
+
+    def _place(self) -> None:
+        if not self._new:
+            return
+        poses = np.concatenate([poses[:, :8] for poses, _ in self._new])[-_KEEP:]
+        fixes = np.repeat([last for _, last in self._new], [len(poses) for poses, _ in self._new])[-_KEEP:]
+        self._new.clear()
+        n = len(poses)
         if self._end + n > len(self._rows):
             self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
             self._end = _KEEP
         self._end += n
-        return self._rows[self._end - n : self._end]
+        rows = self._rows[self._end - n : self._end]
+        rows[:, :8], rows[:, 8] = poses, fixes
 
     def at(self, t: float, longest: float) -> tuple[Array, float] | None:
         """The pose (7,) for instant t and the last fix in it; None if there was none, in a gap longer than that, s."""
+        self._place()
         after = bisect_left(self._instants, t, 0, self._end)
         if not 0 < after < self._end:
             return None
@@ -82,8 +100,9 @@ class Health:
         # By key: when it was first and last said, and how it was said last.
         self.said: dict[tuple[str, str], tuple[float, float, Diagnosis]] = {}
         self._planar = localiser.motion != "free"
-        self._rows = np.empty((2 * _KEEP, 7))
-        self._end = self._digested = 0
+        # Samples of which no chunk has been made.
+        self._samples: list[Array] = []
+        self._undigested = 0
         self._began = self._t_before = math.nan
         self._last_fix = -math.inf
         self._oldest, self._newest = math.inf, -math.inf  # stamps of fixes
@@ -102,21 +121,16 @@ class Health:
     # Looking on
 
     def sampled(self, samples: Array, track: Array) -> None:
-        """Samples (n, 7) that were fed, and the track (n, 8) of it: what was published with each."""
-        n = len(samples)
-        if n > _KEEP:
-            for at in range(0, n, _KEEP):
+        """Samples (n, 7) that were fed, and the track (n, 8) of it: what was published with each. Both are kept."""
+        if len(samples) > _KEEP:
+            for at in range(0, len(samples), _KEEP):
                 self.sampled(samples[at : at + _KEEP], track[at : at + _KEEP])
             return
-        if self._end + n > len(self._rows):
+        self._samples.append(samples)
+        self._undigested += len(samples)
+        if self._undigested >= _KEEP:
             self._digest()
-            self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
-            self._digested -= self._end - _KEEP
-            self._end = _KEEP
-        self._rows[self._end : self._end + n] = samples
-        self._end += n
-        given = self._given[0].next(n)
-        given[:, :8], given[:, 8] = track, self._last_fix
+        self._given[0].add(track, self._last_fix)
 
     def wheels(self, odometry: WheelOdometry) -> None:
         """Readings of the wheels that were fed."""
@@ -126,12 +140,13 @@ class Health:
 
     def published(self, pose: Pose) -> None:
         """A pose that was given out, later than the one before."""
-        self._given[1].next(1)[0] = pose.numbers[:9]
+        self._given[1].add(pose.numbers[np.newaxis], pose.t - pose.fix_age)
 
     def another_imu(self) -> None:
         """The device has connected anew, or it is another one: what the last one sent is no measure for it."""
         self._chunks.clear()
-        self._digested = self._end
+        self._samples.clear()
+        self._undigested = 0
         self._t_before = math.nan
 
     def arrived(self, fix: PoseFix) -> None:
@@ -193,11 +208,12 @@ class Health:
 
     def _digest(self) -> None:
         """Make a chunk of the rows since the last one."""
-        count = (self._end - self._digested) // BLOCK
+        count = self._undigested // BLOCK
         if not count:
             return
-        rows = self._rows[self._digested : self._digested + count * BLOCK]
-        self._digested += count * BLOCK
+        together = np.concatenate(self._samples)
+        rows, rest = together[: count * BLOCK], together[count * BLOCK :]
+        self._samples, self._undigested = [rest], len(rest)
         t = rows[:, 0]
         if math.isnan(self._t_before):
             self._t_before = float(t[0])

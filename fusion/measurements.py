@@ -11,6 +11,7 @@ axes, which is also the order and meaning of ROS's PoseWithCovariance.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 from typing import Self
@@ -159,6 +160,12 @@ class Mode(StrEnum):
     LOST = "LOST"
 
 
+def heading(quaternion_wxyz: Sequence[float]) -> float:
+    """Of body x in the floor plane, rad, anticlockwise from world x, in (-pi, pi]."""
+    w, x, y, z = quaternion_wxyz
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
 # Where the parts of a pose stand in its `numbers`, as the kernels lay them out: its instant comes first, and between
 # quaternion and velocity that of the last fix in it.
 POSITION, QUATERNION, VELOCITY, ANGULAR_VELOCITY = slice(1, 4), slice(4, 8), slice(9, 12), slice(12, 15)
@@ -238,8 +245,7 @@ class Pose(msgspec.Struct, frozen=True, eq=False):  # Made several times as fast
     @property
     def yaw(self) -> float:
         """Heading of body x in the floor plane, rad, anticlockwise from world x, in (-pi, pi]."""
-        w, x, y, z = self.quaternion_wxyz.tolist()
-        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return heading(self.quaternion_wxyz.tolist())
 
 
 class Outcome(IntEnum):

@@ -9,6 +9,7 @@ import functools
 import json
 import math
 import re
+import struct
 from collections.abc import Callable
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -24,6 +25,7 @@ from fusion.measurements import (
     VELOCITY,
     Array,
     Pose,
+    heading,
 )
 from fusion.params import GRAVITY
 from imu.clock import Reading
@@ -363,7 +365,7 @@ def pose_message(pose: Pose, published: float, seq: int, t_robot: float | None =
         frame="world",
         position=numbers[POSITION],
         orientation_wxyz=numbers[QUATERNION],
-        yaw=pose.yaw,
+        yaw=heading(numbers[QUATERNION]),
         velocity=numbers[VELOCITY],
         angular_velocity=numbers[ANGULAR_VELOCITY],
         covariance=numbers[COVARIANCE],
@@ -373,6 +375,16 @@ def pose_message(pose: Pose, published: float, seq: int, t_robot: float | None =
         reset_step=step if pose.reset_id and any(step := numbers[RESET_STEP]) else UNSET,
         t_robot=UNSET if t_robot is None else t_robot,
     )
+
+
+def frame(data: bytes, text: bool) -> bytes:
+    """A message as a server's WebSocket frame: RFC 6455, section 5.2."""
+    kind, length = 0x81 if text else 0x82, len(data)
+    if length < 126:
+        return bytes((kind, length)) + data
+    if length < 65536:
+        return struct.pack("!BBH", kind, 126, length) + data
+    return struct.pack("!BBQ", kind, 127, length) + data
 
 
 def tracker_message(id: int, corners_px: Array, camera_from_marker: Array) -> bytes:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
+from websockets.frames import Frame, Opcode
 
 from fusion.geometry import rotation_about_z, transform
 from fusion.measurements import Mode, Pose
@@ -23,6 +24,7 @@ from server.messages import (
     Units,
     Wheels,
     encode,
+    frame,
     pose_message,
     tracker_message,
 )
@@ -61,6 +63,13 @@ def test_a_pose_on_the_wire() -> None:
         "reset_id": 2,
         "fix_age": 0.41,
     }
+
+
+@pytest.mark.parametrize("opcode", [Opcode.TEXT, Opcode.BINARY])
+@pytest.mark.parametrize("length", [0, 125, 126, 65535, 65536])
+def test_a_frame_is_the_librarys(length: int, opcode: Opcode) -> None:
+    data = bytes(length)
+    assert frame(data, opcode is Opcode.TEXT) == Frame(opcode, data).serialize(mask=False)
 
 
 def test_the_robots_own_time_is_there_only_when_it_is_known() -> None:
