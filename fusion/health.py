@@ -37,44 +37,26 @@ _ROOTS |= {"wheel_unit", "wheel_turn_unit"}
 _BESIDES = {"imu_missing", "imu_stamps_repeat", "no_fix", "fixes_lost", "fixes_late", "fixes_early"}
 
 _KEEP = 4096  # poses that stay when their ring is full, and samples of which a chunk is made at the latest
-_SEVERAL = 100  # times that poses came, after which they are put into their ring also unasked
 
 
 class _Poses:
-    """Poses that were given out, and the last fix in each: rows of t, position, quaternion wxyz, instant of the fix.
-
-    They are put in their place when they are asked for, which is far more seldom than they come.
-    """
+    """Poses that were given out, and the last fix in each: rows of t, position, quaternion wxyz, instant of the fix."""
 
     def __init__(self) -> None:
         self._rows = np.empty((2 * _KEEP, 9))
         self._instants = self._rows[:, 0]
         self._end = 0
-        self._new: list[tuple[Array, float]] = []
 
-    def add(self, poses: Array, last_fix: float) -> None:
-        """Rows of which the first 8 columns count."""
-        self._new.append((poses, last_fix))
-        if len(self._new) >= _SEVERAL:
-            self._place()
-
-    def _place(self) -> None:
-        if not self._new:
-            return
-        poses = np.concatenate([poses[:, :8] for poses, _ in self._new])[-_KEEP:]
-        fixes = np.repeat([last for _, last in self._new], [len(poses) for poses, _ in self._new])[-_KEEP:]
-        self._new.clear()
-        n = len(poses)
+    def next(self, n: int) -> Array:
+        """(n, 9), to be filled with as many more; n <= _KEEP."""
         if self._end + n > len(self._rows):
             self._rows[:_KEEP] = self._rows[self._end - _KEEP : self._end]
             self._end = _KEEP
         self._end += n
-        rows = self._rows[self._end - n : self._end]
-        rows[:, :8], rows[:, 8] = poses, fixes
+        return self._rows[self._end - n : self._end]
 
     def at(self, t: float, longest: float) -> tuple[Array, float] | None:
         """The pose (7,) for instant t and the last fix in it; None if there was none, in a gap longer than that, s."""
-        self._place()
         after = bisect_left(self._instants, t, 0, self._end)
         if not 0 < after < self._end:
             return None
@@ -121,7 +103,7 @@ class Health:
     # Looking on
 
     def sampled(self, samples: Array, track: Array) -> None:
-        """Samples (n, 7) that were fed, and the track (n, 8) of it: what was published with each. Both are kept."""
+        """Samples (n, 7) that were fed, and the track (n, 8) of it: what was published with each."""
         if len(samples) > _KEEP:
             for at in range(0, len(samples), _KEEP):
                 self.sampled(samples[at : at + _KEEP], track[at : at + _KEEP])
@@ -130,7 +112,8 @@ class Health:
         self._undigested += len(samples)
         if self._undigested >= _KEEP:
             self._digest()
-        self._given[0].add(track, self._last_fix)
+        given = self._given[0].next(len(samples))
+        given[:, :8], given[:, 8] = track, self._last_fix
 
     def wheels(self, odometry: WheelOdometry) -> None:
         """Readings of the wheels that were fed."""
@@ -140,7 +123,7 @@ class Health:
 
     def published(self, pose: Pose) -> None:
         """A pose that was given out, later than the one before."""
-        self._given[1].add(pose.numbers[np.newaxis], pose.t - pose.fix_age)
+        self._given[1].next(1)[0] = pose.numbers[:9]
 
     def another_imu(self) -> None:
         """The device has connected anew, or it is another one: what the last one sent is no measure for it."""

@@ -59,7 +59,7 @@ from server.messages import (
 )
 from server.remote_cameras import RemoteCamera
 from server.robots import Recording, Robot
-from server.visitor import RefusedError, Visitor, for_log
+from server.visitor import Connection, RefusedError, Visitor, for_log
 
 log = logging.getLogger("steadfix")
 
@@ -141,6 +141,7 @@ class Service:
                 port,
                 process_request=self._door.answer,
                 ssl=tls(self.config.server.certificate, self.config.server.key),
+                create_connection=Connection,
                 compression=None,
                 max_size=MAX_MESSAGE,
                 close_timeout=CLOSE_TIMEOUT,
@@ -434,6 +435,7 @@ class Service:
     async def _serve(self, connection: ServerConnection) -> None:
         assert connection.request is not None
         url = urlsplit(connection.request.path)
+        assert isinstance(connection, Connection)
         visitor = Visitor(connection, url.path)
         self._visitors.add(visitor)
         try:
@@ -580,16 +582,19 @@ class Service:
         clock = asyncio.create_task(self._ask_clock(link))
         try:
             with self._client(visitor, topics, rate_hz) as subscription:
+
+                def take(data: str | bytes) -> None:
+                    link.heard = time.monotonic()
+                    self._hear(robot, link, data, link.heard)
+                    self._answer_robot(robot, link, subscription)
+
                 while True:
-                    data = await visitor.receive()
-                    arrival = link.heard = time.monotonic()
+                    data = await visitor.receive(take)
                     try:
-                        self._hear(robot, link, data, arrival)
+                        take(data)
                     except MessageError as error:
                         robot.dropped += 1
                         await visitor.refuse(error)
-                    else:
-                        self._answer_robot(robot, link, subscription)
         finally:
             clock.cancel()
             if self._links.get(hello.robot) is link:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import time
 from collections.abc import Callable
@@ -11,6 +12,8 @@ from typing import TypeVar
 import msgspec
 from websockets.asyncio.server import ServerConnection, broadcast
 from websockets.datastructures import Headers
+from websockets.frames import DATA_OPCODES, Frame, Opcode
+from websockets.protocol import Event
 
 from server.access import is_local, token_matches
 from server.messages import Dialect, Error, MessageError, Notice
@@ -41,10 +44,31 @@ class RefusedError(Exception):
         self.retry = retry
 
 
+class Connection(ServerConnection):
+    """A connection that hands messages over where they come, to whoever waits for them, instead of waking it."""
+
+    # Takes a message, or leaves it to `recv` by False.
+    at_once: Callable[[str | bytes], bool] | None = None
+
+    def process_event(self, event: Event) -> None:
+        if self.at_once is not None and isinstance(event, Frame) and event.opcode in DATA_OPCODES:
+            if event.fin and event.opcode is not Opcode.CONT and self._taken(event, self.at_once):
+                return
+            self.at_once = None  # what follows must wait behind this one
+        super().process_event(event)
+
+    def _taken(self, frame: Frame, at_once: Callable[[str | bytes], bool]) -> bool:
+        try:
+            data = str(frame.data, "utf-8") if frame.opcode is Opcode.TEXT else bytes(frame.data)
+        except UnicodeDecodeError:
+            return False
+        return at_once(data)
+
+
 class Visitor:
     """One connection: who it is, how it speaks, what it may still send, and what it was refused."""
 
-    def __init__(self, connection: ServerConnection, path: str) -> None:
+    def __init__(self, connection: Connection, path: str) -> None:
         assert connection.request is not None
         self.connection = connection
         peer = connection.remote_address
@@ -58,8 +82,12 @@ class Visitor:
         self._credited = time.monotonic()
         self._told = False
 
-    async def receive(self) -> str | bytes:
-        """Its next message. One that sends too much is not read for a while. Raises ConnectionClosed."""
+    async def receive(self, take: Callable[[str | bytes], None] | None = None) -> str | bytes:
+        """Its next message. One that sends too much is not read for a while. Raises ConnectionClosed.
+
+        `take` is given those that come while this waits; returned is then only what it refused with a MessageError,
+        or what was more than may be sent.
+        """
         if self._credit < 0.0:
             if not self._told:
                 self._told = True
@@ -68,12 +96,29 @@ class Visitor:
                 log.warning("%s: %s", self.name, text)
                 self.tell_now(Notice(text))
             await asyncio.sleep(-self._credit / BYTES_PER_SECOND)
-        data = await self.connection.recv()
+        self.connection.at_once = None if take is None else functools.partial(self._taken, take)
+        try:
+            data = await self.connection.recv()
+        finally:
+            self.connection.at_once = None
+        self._spend(data)
+        return data
+
+    def _taken(self, take: Callable[[str | bytes], None], data: str | bytes) -> bool:
+        if self._credit < 0.0:
+            return False
+        try:
+            take(data)
+        except MessageError:
+            return False
+        self._spend(data)
+        return True
+
+    def _spend(self, data: str | bytes) -> None:
         now = time.monotonic()
         earned = (now - self._credited) * BYTES_PER_SECOND
         self._credit = min(self._credit + earned, BYTES_PER_SECOND * SAVED_UP) - len(data) - MESSAGE_COST
         self._credited = now
-        return data
 
     async def tell(self, message: msgspec.Struct) -> None:
         """Waits until the client takes it."""
