@@ -433,9 +433,9 @@ class Service:
     # WebSockets
 
     async def _serve(self, connection: ServerConnection) -> None:
+        assert isinstance(connection, Connection)
         assert connection.request is not None
         url = urlsplit(connection.request.path)
-        assert isinstance(connection, Connection)
         visitor = Visitor(connection, url.path)
         self._visitors.add(visitor)
         try:
@@ -522,11 +522,8 @@ class Service:
     def _client(
         self, visitor: Visitor, topics: Collection[Topic], rate_hz: float = 0.0, room: int = 0
     ) -> AbstractContextManager[Subscription]:
-        protocol, transport, text = (
-            visitor.connection.protocol,
-            visitor.connection.transport,
-            not visitor.dialect.binary,
-        )
+        protocol, transport = visitor.connection.protocol, visitor.connection.transport
+        text = not visitor.dialect.binary
         if (sock := transport.get_extra_info("socket")) is not None and hasattr(socket, "TCP_NOTSENT_LOWAT"):
             # What a slow client has not taken then waits here, where the newer replaces it, and not in the kernel.
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 16 * 1024)

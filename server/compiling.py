@@ -18,7 +18,7 @@ PATIENCE = 3.0
 NOTICE = "compiling the filters; this happens once after each update and may take a minute"
 
 
-# numba compiles one thing at a time in an interpreter, and others find it in its cache.
+# For other interpreters: in each numba compiles one thing at a time, and all find it in its cache.
 _MOVING = "from fusion import kernels; kernels.compile_moving()"
 _CAMERA = "from camera import edges, planar; edges.warm_up(); planar.warm_up()"
 
