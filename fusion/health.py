@@ -25,7 +25,16 @@ from fusion.consistency import chi2_bounds
 from fusion.diagnosis import BLOCK, WINDOW, Chunk, Diagnosis, JudgedFix, Score, Seen
 from fusion.fix_faults import BELIEVED, LEARNED_STEP, is_turned
 from fusion.localiser import Localiser
-from fusion.measurements import Array, FixOutcome, Outcome, Pose, PoseFix, PoseHypothesis, WheelOdometry
+from fusion.measurements import (
+    LAST_FIX,
+    Array,
+    FixOutcome,
+    Outcome,
+    Pose,
+    PoseFix,
+    PoseHypothesis,
+    WheelOdometry,
+)
 from fusion.params import Channel
 
 NIS_FIXES = 60  # fixes of the running NIS
@@ -123,7 +132,7 @@ class Health:
 
     def published(self, pose: Pose) -> None:
         """A pose that was given out, later than the one before."""
-        self._given[1].next(1)[0] = pose.numbers[:9]
+        self._given[1].next(1)[0] = pose.numbers[: LAST_FIX + 1]
 
     def another_imu(self) -> None:
         """The device has connected anew, or it is another one: what the last one sent is no measure for it."""

@@ -166,8 +166,9 @@ def heading(quaternion_wxyz: Sequence[float]) -> float:
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-# Where the parts of a pose stand in its `numbers`, as the kernels lay them out: its instant comes first, and between
-# quaternion and velocity that of the last fix in it.
+# Where the parts of a pose stand in its `numbers`, as the kernels lay them out. The first, up to the instant of the
+# last fix in it, are what is kept of those that were published.
+INSTANT, LAST_FIX = 0, 8
 POSITION, QUATERNION, VELOCITY, ANGULAR_VELOCITY = slice(1, 4), slice(4, 8), slice(9, 12), slice(12, 15)
 COVARIANCE, VELOCITY_COVARIANCE, RESET_STEP = slice(15, 51), slice(51, 60), slice(60, 66)
 POSE_NUMBERS = 68
@@ -181,7 +182,7 @@ class Pose(msgspec.Struct, frozen=True, eq=False):  # Made several times as fast
     `reset_id` rises by one whenever the pose was set anew instead of corrected.
     `fix_age`: s from the last accepted fix's capture to `t`; inf before the first.
     `reset_step`: (6,) by how much the smooth channel stepped at its last reset, m and rad, world axes.
-    `numbers`: (POSE_NUMBERS,) all that are arrays, in one: thousands of poses a second are taken apart only when asked.
+    `numbers`: (POSE_NUMBERS,) one row, as the filter gives it: taken apart only when something of it is asked for.
     """
 
     robot: str
@@ -208,7 +209,7 @@ class Pose(msgspec.Struct, frozen=True, eq=False):  # Made several times as fast
     ) -> Self:
         """A pose that does not come from a filter."""
         numbers = np.zeros(POSE_NUMBERS)
-        numbers[0], numbers[8] = t, t - fix_age
+        numbers[INSTANT], numbers[LAST_FIX] = t, t - fix_age
         numbers[POSITION], numbers[QUATERNION] = position, quaternion_wxyz
         numbers[VELOCITY], numbers[ANGULAR_VELOCITY] = velocity, angular_velocity
         numbers[COVARIANCE], numbers[VELOCITY_COVARIANCE] = covariance.ravel(), velocity_covariance.ravel()

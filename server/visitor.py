@@ -52,12 +52,12 @@ class Connection(ServerConnection):
 
     def process_event(self, event: Event) -> None:
         if self.at_once is not None and isinstance(event, Frame) and event.opcode in DATA_OPCODES:
-            if event.fin and event.opcode is not Opcode.CONT and self._taken(event, self.at_once):
+            if event.fin and event.opcode is not Opcode.CONT and self._handed_over(event, self.at_once):
                 return
             self.at_once = None  # what follows must wait behind this one
         super().process_event(event)
 
-    def _taken(self, frame: Frame, at_once: Callable[[str | bytes], bool]) -> bool:
+    def _handed_over(self, frame: Frame, at_once: Callable[[str | bytes], bool]) -> bool:
         try:
             data = str(frame.data, "utf-8") if frame.opcode is Opcode.TEXT else bytes(frame.data)
         except UnicodeDecodeError:

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from fusion import kernels as k
+from fusion import measurements as m
 from fusion.geometry import exp_so3, quaternion_from_rotation, wrap
 from fusion.localiser import Localiser
 from fusion.measurements import ImuBatch, MeasurementError, Mode, Outcome, PoseFix, PoseHypothesis
@@ -281,3 +283,13 @@ def test_the_smooth_channel_is_continuous_where_it_was_published(drive):
             worst[channel] = max(worst[channel], step)
     assert worst["smooth"] < 0.001
     assert worst["best"] > 0.005
+
+
+def test_the_numbers_of_a_pose_stand_where_the_kernels_put_them():
+    """Two places say it: numba's cache would not notice if the kernels took it from the other."""
+    slices = {
+        k.P_POS: m.POSITION, k.P_QUAT: m.QUATERNION, k.P_VEL: m.VELOCITY, k.P_RATE: m.ANGULAR_VELOCITY,
+        k.P_COV: m.COVARIANCE, k.P_VCOV: m.VELOCITY_COVARIANCE, k.P_STEP: m.RESET_STEP,
+    }  # fmt: skip
+    assert list(slices) == [part.start for part in slices.values()]
+    assert (k.P_T, k.P_T_ACCEPTED, k.POSE) == (m.INSTANT, m.LAST_FIX, m.POSE_NUMBERS)

@@ -346,28 +346,20 @@ def test_rubbish_is_answered_counted_and_survived(data: str | bytes, expected: s
 
 def test_messages_that_come_together_are_taken_in_their_order() -> None:
     """Whole ones where they come, what is refused or comes in parts by the task that waits for it."""
-    rates: list[float] = []
-
-    class Kept:
-        def imu(self, batch: ImuBatch) -> None:
-            rates.extend(batch.samples[:, 1].tolist())
-
-        def fix(self, fix: PoseFix) -> None: ...
-        def wheels(self, odometry: WheelOdometry) -> None: ...
-        def track(self, robot: str, track: Array) -> None: ...
+    recording = Recording()
 
     def numbered(k: int) -> str:
         return json.dumps({"type": "imu", "samples": [[5.0 + 0.005 * k, 1e-3 * k, 0.0, 0.0, 0.0, 0.0, 9.80665]]})
 
     async def main() -> None:
-        async with serving(recording=Kept()) as service, client(service, "/v1/robot") as connection:
+        async with serving(recording=recording) as service, client(service, "/v1/robot") as connection:
             await hello(connection)
             for k in range(0, 40, 4):
                 parts = numbered(k + 2)
                 for message in (numbered(k), numbered(k + 1), "rubbish", [parts[:20], parts[20:]], numbered(k + 3)):
                     await connection.send(message)
-            await until(lambda: len(rates) == 40)
-            assert rates == [1e-3 * k for k in range(40)]
+            await until(lambda: len(recording.batches) == 40)
+            assert [batch.samples[0, 1] for batch in recording.batches] == [1e-3 * k for k in range(40)]
             for _ in range(10):
                 assert "this is not JSON" in (await heard(connection, "error"))["reason"]
             assert (await health(service))["messages_refused"] == 10
